@@ -147,23 +147,26 @@ def motion_findings(
 
     frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
     """
-    offsets, found = ({}, []) if model is None else _arm_findings(model, frames, states, units)
+    offsets, findings = ({}, []) if model is None else _arm_findings(model, frames, states, units)
     if offsets:
-        return [*_timing_findings(offsets), *found]
+        return [*_timing_findings(offsets), *findings]
     if not motion.cameras:
-        return found
+        return findings
     offset = estimate_clock_offset(list(states.select(select_states(states.stamp_ns, motion))), motion)
     if offset.offset_s is None or offset.uncertainty_s is None:
-        return [note("robot-clock", "joint states", offset.sentence), *found]
+        return [note("robot-clock", "joint states", offset.sentence), *findings]
     least_s = limits.TIME_OFFSET + 2 * offset.uncertainty_s
-    return [_clock_finding("joint states", offset.sentence, offset.offset_s, least_s, 1e3 * offset.offset_s), *found]
+    return [
+        _clock_finding("joint states", offset.sentence, offset.offset_s, least_s, 1e3 * offset.offset_s),
+        *findings,
+    ]
 
 
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns, units: Iterable[float | None]
 ) -> tuple[dict[str, float], list[Finding]]:
     posture = states.postures(limits.ARM_CLOSE_NS)
-    found: list[Finding] = []
+    findings: list[Finding] = []
     timings: dict[str, tuple[float, float]] = {}
     bad: dict[str, ArmAgreement] = {}
     for camera in sorted({frame.camera for frame in frames}):
@@ -171,14 +174,14 @@ def _arm_findings(
         where = f"camera {camera}"
         agreement = arm_agreement(model, its, posture)
         if agreement is None:
-            found.append(note("arm", where, "too little of the arm is in view to compare it with the joints"))
+            findings.append(note("arm", where, "too little of the arm is in view to compare it with the joints"))
             continue
         timing = arm_timing(model, its, posture)
         if timing is not None:
             timings[camera] = timing
             agreement = arm_agreement(model, its, posture, offset_s=timing[0]) or agreement
         if agreement.scale is not None:
-            found.append(
+            findings.append(
                 warning(
                     "arm",
                     where,
@@ -188,7 +191,7 @@ def _arm_findings(
                 )
             )
         elif agreement.is_good:
-            found.append(
+            findings.append(
                 note(
                     "arm",
                     where,
@@ -204,7 +207,7 @@ def _arm_findings(
     if bad:
         off = [1e3 * agreement.misfit for agreement in bad.values()]
         through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
-        found.insert(
+        findings.insert(
             0,
             warning(
                 "arm",
@@ -218,22 +221,22 @@ def _arm_findings(
                 unit="mm",
             ),
         )
-    return _own_offsets(timings, model, frames, posture), found
+    return _own_offsets(timings, model, frames, posture), findings
 
 
 def _own_offsets(
     timings: Mapping[str, tuple[float, float]], model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture
 ) -> dict[str, float]:
     middle = float(np.median([offset_s for offset_s, _ in timings.values()] or [0.0]))
-    kept = {}
+    offsets = {}
     for camera, (offset_s, misfit) in timings.items():
         at_middle = arm_agreement(
             model, thin_frames([frame for frame in frames if frame.camera == camera]), posture, offset_s=middle
         )
         is_other = abs(offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
         if not is_other or at_middle is None or misfit < limits.TIME_OWN * at_middle.misfit:
-            kept[camera] = offset_s
-    return kept
+            offsets[camera] = offset_s
+    return offsets
 
 
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
@@ -249,11 +252,14 @@ def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
     apart = limits.TIME_OFFSET + limits.TIME_ERROR
     others = {c: offset for c, offset in offsets.items() if abs(offset - middle) > apart and len(offsets) > 2}
     most = f"; those of most cameras {1e3 * middle:+.0f} ms"
-    found = [_offset_finding(f"camera {c}", offset, most) for c, offset in others.items()]
+    findings = [_offset_finding(f"camera {c}", offset, most) for c, offset in others.items()]
     same = {c: offset for c, offset in offsets.items() if c not in others}
     if len(same) == 2 and np.ptp(list(same.values())) > apart:
-        return [*found, *(_offset_finding(f"camera {c}", offset, "") for c, offset in same.items())]
-    return [*found, _offset_finding("joint states", float(np.mean(list(same.values()))), f" ({len(same)} cameras)")]
+        return [*findings, *(_offset_finding(f"camera {c}", offset, "") for c, offset in same.items())]
+    return [
+        *findings,
+        _offset_finding("joint states", float(np.mean(list(same.values()))), f" ({len(same)} cameras)"),
+    ]
 
 
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:

@@ -68,11 +68,11 @@ def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Findin
 
 
 def calibration_findings(
-    found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]
+    survey: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]
 ) -> Iterator[Finding]:
     """Findings on CameraInfo; `changed`: stamps of first changes."""
     unset = NOTE if cameras and all(camera.info for camera in cameras) else WARNING
-    for entry in found.select_types(CAMERA_INFO):
+    for entry in survey.select_types(CAMERA_INFO):
         name, is_unset = entry.topic.name, entry.calibration is None
         text = "K is zero: the camera was never calibrated"
         yield from judge(unset if is_unset else None, "uncalibrated", name, text)
@@ -84,17 +84,17 @@ def calibration_findings(
     for topic, info in dict.fromkeys(
         [(c.color, c.info) for c in cameras] + [(c.depth, c.depth_info) for c in cameras]
     ):
-        its = found.topics[info].calibration if info else None
+        its = survey.topics[info].calibration if info else None
         if its is not None:
-            yield from _distortion(info, its, topic, image_lens(found, topic, its))
+            yield from _distortion(info, its, topic, image_lens(survey, topic, its))
     for camera in cameras:
         for topic, info in ((camera.color, camera.info), (camera.depth, camera.depth_info or camera.info)):
-            image, its = found.topics[topic].first_image, found.topics[info].calibration if info else None
+            image, its = survey.topics[topic].first_image, survey.topics[info].calibration if info else None
             if image is not None and its is not None and its.width:
                 size, expected = (f"{one.width}x{one.height}" for one in (image, its))
                 text = f"{topic} is {size}, its CameraInfo {expected}"
                 yield from judge(ERROR if size != expected else None, "camera-info-size", info, text)
-        yield from _rivals(found, camera)
+        yield from _rivals(survey, camera)
 
 
 def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens) -> list[Finding]:
@@ -117,9 +117,9 @@ def _distortion(name: str, calibration: Calibration, topic: str, lens: ImageLens
     return judge(severity, "distortion", name, f"{text}{says}", remedies[severity])
 
 
-def _rivals(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
-    chosen = found.topics[camera.info].calibration if camera.info else None
-    for entry in found.select_types(CAMERA_INFO):
+def _rivals(survey: Survey, camera: CameraTopics) -> Iterator[Finding]:
+    chosen = survey.topics[camera.info].calibration if camera.info else None
+    for entry in survey.select_types(CAMERA_INFO):
         name, other = entry.topic.name, entry.calibration
         if chosen is None or other is None or name in (camera.info, camera.depth_info):
             continue
@@ -133,11 +133,11 @@ def _rivals(found: Survey, camera: CameraTopics) -> Iterator[Finding]:
         )
 
 
-def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> Iterator[Finding]:
+def tf_findings(survey: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> Iterator[Finding]:
     """Findings on separate trees, and on frames with two parents."""
-    tf, roots = found.tf, found.tf.roots
+    tf, roots = survey.tf, survey.tf.roots
     yield from (warning("tf-parents", "tf", text, "let one node publish each frame") for text in tf.notes)
-    images = [found.topics[camera.color].first_image for camera in cameras]
+    images = [survey.topics[camera.color].first_image for camera in cameras]
     trees = {tf.root_of(image.frame_id) for image in images if image is not None and image.frame_id in tf.frames}
     text = f"{len(roots)} separate trees, with roots {', '.join(roots[:6])}"
     is_parted = len(trees) > 1 and not options.camera_poses
@@ -183,22 +183,22 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
 
 
 def camera_findings(
-    found: Survey, topics: CameraTopics, camera: Camera | None, options: SourceOptions
+    survey: Survey, topics: CameraTopics, camera: Camera | None, options: SourceOptions
 ) -> Iterator[Finding]:
-    yield from _pairing(found, topics, options)
-    yield from _lens(found, topics, options)
+    yield from _pairing(survey, topics, options)
+    yield from _lens(survey, topics, options)
     if camera is None or camera.fixed_pose is not None:
         return
-    stamps = sorted(found.topics[topics.color].stamps_ns)[: limits.POSES_LOOKED_UP]
+    stamps = sorted(survey.topics[topics.color].stamps_ns)[: limits.POSES_LOOKED_UP]
     tolerance_ns = round(options.pose_tolerance_s * 1e9)
     yield from pose_findings(
-        f"camera {topics.name}", stamps, [camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in stamps]
+        f"camera {topics.name}", stamps, [camera.pose_at(survey.tf, stamp, tolerance_ns) for stamp in stamps]
     )
 
 
-def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
+def _pairing(survey: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
     where, tolerance = f"camera {camera.name}", options.pairing_tolerance_s
-    color, depth = (found.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
+    color, depth = (survey.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
     pairs = pair_images(color, depth, round(tolerance * 1e9)).tolist()
     rarer, other = sorted((len(color), len(depth)))
     if not pairs or not rarer:
@@ -237,14 +237,14 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
     ]
 
 
-def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
-    where, image = f"camera {topics.name}", found.topics[topics.color].first_image
-    given = options.intrinsics.get(topics.name)
-    if given is not None and image is not None:
-        fx, fy, cx, cy = given[:4]
+def _lens(survey: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
+    where, image = f"camera {topics.name}", survey.topics[topics.color].first_image
+    option = options.intrinsics.get(topics.name)
+    if option is not None and image is not None:
+        fx, fy, cx, cy = option[:4]
         return lens_findings(
             where, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height), "--intrinsics"
         )
     names = dict.fromkeys(name for name in (topics.info, topics.depth_info) if name)
-    known = [(name, its) for name in names if (its := found.topics[name].calibration) is not None and its.width]
+    known = [(name, its) for name in names if (its := survey.topics[name].calibration) is not None and its.width]
     return [finding for name, its in known for finding in lens_findings(where, intrinsics_of(its), name)]

@@ -118,9 +118,9 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
     """Log brightness (N, B) by bands of rows, less a parabola: gloss varies slowly."""
-    found = bands.gains(np.ones(bands.num_images, np.bool_))
-    logs = np.log(found).mean(axis=2)
-    if bands.misfit(found) > limits.EXPOSURE_LEFT * bands.misfit(gains):
+    gains_by_band = bands.gains(np.ones(bands.num_images, np.bool_))
+    logs = np.log(gains_by_band).mean(axis=2)
+    if bands.misfit(gains_by_band) > limits.EXPOSURE_LEFT * bands.misfit(gains):
         return np.zeros_like(logs)
     curves = np.linalg.qr(np.vander(np.arange(bands.num_bands), 3).astype(np.float64))[0]
     return np.asarray(logs - logs @ curves @ curves.T)

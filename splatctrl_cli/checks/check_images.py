@@ -208,7 +208,7 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
 def depth_findings(images: ImageWatch) -> list[Finding]:
     where, num, num_empty = images.where, images.num_decoded, images.num_without_depth
     is_empty = 0 < num_empty == num
-    found = judge(
+    findings = judge(
         None if not num_empty else ERROR if is_empty else WARNING,
         "depth-empty",
         where,
@@ -216,12 +216,12 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
         value=num_empty,
     )
     if is_empty:
-        return found
+        return findings
     share = float(np.median(images.shares))
     ((constant, times),) = images.constants.most_common(1) or [(0.0, 0)]
     is_code = times and times >= limits.CONSTANT_IMAGES * num
     return [
-        *found,
+        *findings,
         *judge(
             None if share >= limits.SOME_DEPTH else WARNING if share < limits.LITTLE_DEPTH else NOTE,
             "depth-share",
@@ -280,7 +280,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         for camera in sorted({frame.camera for frame in frames})
         if (its := [frame for frame in frames if frame.camera == camera and frame.color.any()])
     }
-    found: list[Finding] = []
+    findings: list[Finding] = []
     others: dict[str, tuple[str, float, float]] = {}
     for camera, spectra in edges.items():
         surface = _correlate(spectra)
@@ -289,7 +289,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
             if max(abs(du), abs(dv)) > max(limits.EDGE_SHIFT * width, limits.EDGE_AROUND):
                 share = 100 * max(abs(du), abs(dv)) / width
-                found.append(
+                findings.append(
                     error(
                         "alignment",
                         f"camera {camera}",
@@ -305,7 +305,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         elif (other := _other(camera, edges, _extrapolate_to_zero(surface))) is not None:
             others[camera] = other
     for camera, (name, own, peak) in others.items():
-        found += judge(
+        findings += judge(
             ERROR if name in others else WARNING,  # an exchange has two sides
             "alignment",
             f"camera {camera}",
@@ -314,7 +314,7 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
             "exchange the depth topics, with --camera NAME=COLOR,DEPTH",
             value=own,
         )
-    return found
+    return findings
 
 
 def _other(

@@ -161,8 +161,8 @@ class LogWatch(JoinedLog):
     def _info(self, message: RawMessage, stamp: int) -> None:
         info = self._decoder.decode(message)
         fields = {name.lower(): getattr(info, name) for name in ("K", "k", "D", "d") if hasattr(info, name)}
-        said = (info.width, info.height, tuple(fields["k"]), tuple(fields["d"]))
-        if self._infos.setdefault(message.topic.name, said) != said:
+        content = (info.width, info.height, tuple(fields["k"]), tuple(fields["d"]))
+        if self._infos.setdefault(message.topic.name, content) != content:
             self.changed_infos[message.topic.name] = stamp
 
     def _transforms(self, message: RawMessage) -> None:
@@ -176,10 +176,10 @@ class LogWatch(JoinedLog):
             )
 
 
-def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
+def ready(log: RawLog, log_survey: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
     """The camera as `ingest` builds it, or None (rig.missing says why)."""
     with suppress(InputError):
-        return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
+        return build_cameras(log, log_survey, replace(options, cameras=(topics.name,)))[0]
     return None
 
 
@@ -196,27 +196,30 @@ def reduced_frames(
     color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
-    kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
+    kept_colors = {small.stamp_ns: small for small in (colors.kept if colors is not None else ())}
     frames = []
-    for kept in depths.kept if depths is not None else ():
-        near = min(sorted(kept_colors), key=lambda stamp: abs(stamp - kept.stamp_ns), default=None)
-        is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
+    for small in depths.kept if depths is not None else ():
+        near = min(sorted(kept_colors), key=lambda stamp: abs(stamp - small.stamp_ns), default=None)
+        is_near = near is not None and abs(near - small.stamp_ns) <= options.pairing_tolerance_s * 1e9
         color = kept_colors[near] if near is not None and is_near else None
-        stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
+        stamp_ns = small.stamp_ns if color is None else color.stamp_ns
         T = camera.pose_at(tf, stamp_ns - late_ns.get(camera.name, 0), round(options.pose_tolerance_s * 1e9))
         if T is not None:
-            frames.append(_frame(camera, kept, color, stamp_ns, T))
+            frames.append(_frame(camera, small, color, stamp_ns, T))
     return frames
 
 
-def _frame(camera: Camera, kept: Thumbnail, color: Thumbnail | None, stamp_ns: int, T: Float64) -> RgbdFrame:
-    depth, stride = kept.pixels, kept.stride
+def _frame(camera: Camera, small: Thumbnail, color: Thumbnail | None, stamp_ns: int, T: Float64) -> RgbdFrame:
+    depth, stride = small.pixels, small.stride
     if camera.depth_lens is not None and camera.T_color_depth is not None:
-        stride = max(1, round(camera.intrinsics.height / kept.pixels.shape[0]))
-        own, target = strided_lens(camera.depth_lens.intrinsics, kept.stride), strided_lens(camera.intrinsics, stride)
+        stride = max(1, round(camera.intrinsics.height / small.pixels.shape[0]))
+        own, target = (
+            strided_lens(camera.depth_lens.intrinsics, small.stride),
+            strided_lens(camera.intrinsics, stride),
+        )
         depth = warp_depth(depth, own, target, camera.T_color_depth)
     elif camera.maps is not None:
-        depth = camera.remap(_enlarge(depth, kept))[::stride, ::stride]
+        depth = camera.remap(_enlarge(depth, small))[::stride, ::stride]
     pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
     if color is not None and color.pixels.ndim == 3:
         pixels = color.pixels
@@ -234,8 +237,10 @@ def _frame(camera: Camera, kept: Thumbnail, color: Thumbnail | None, stamp_ns: i
     )
 
 
-def _enlarge(image: NDArray[Any], kept: Thumbnail) -> NDArray[Any]:
-    return np.repeat(np.repeat(image, kept.stride, axis=0)[: kept.height], kept.stride, axis=1)[:, : kept.width]
+def _enlarge(image: NDArray[Any], thumbnail: Thumbnail) -> NDArray[Any]:
+    return np.repeat(np.repeat(image, thumbnail.stride, axis=0)[: thumbnail.height], thumbnail.stride, axis=1)[
+        :, : thumbnail.width
+    ]
 
 
 def image_motion(
@@ -290,32 +295,34 @@ def check_log(
     """
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)
-    found = survey(watch, by_log_time=options.stamps == "log")
-    cameras = _chosen(log, found, options)
-    rig = [(topics, ready(log, found, topics, options)) for topics in cameras]
+    log_survey = survey(watch, by_log_time=options.stamps == "log")
+    cameras = _chosen(log, log_survey, options)
+    rig = [(topics, ready(log, log_survey, topics, options)) for topics in cameras]
     whole = [(topics, camera) for topics, camera in rig if camera is not None]
     for topics, camera in whole:
         if camera.depth_scale is not None and topics.depth in watch.images:
             watch.images[topics.depth].rescale(camera.depth_scale)
-    findings = _findings(log, options, watch, found, rig)
+    findings = _findings(log, options, watch, log_survey, rig)
     correction = read_correction(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in whole if correction is not None}
-    frames = {c.name: reduced_frames(t, c, watch.images, found.tf, options, late_ns) for t, c in whole}
-    of_states = log_states(found, options, model)
+    frames = {c.name: reduced_frames(t, c, watch.images, log_survey.tf, options, late_ns) for t, c in whole}
+    of_states = log_states(log_survey, options, model)
     if correction is not None:
         frames = {name: list(map(correction.frame, its)) for name, its in frames.items()}
         if of_states.states is not None:
             of_states = replace(of_states, states=correction.states(of_states.states))
-    first, last = _span(found)
+    first, last = _span(log_survey)
     report = CheckReport(
         path=str(log.path),
         kind=log.container,
         duration_s=(last - first) * 1e-9,
-        num_messages=found.num_messages,
+        num_messages=log_survey.num_messages,
         start_ns=min((t.first_ns for t in watch.times.values() if t.first_ns), default=None),
         findings=[*findings, *of_states.findings],
         rates=[
-            t.rate(is_read=found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS))
+            t.rate(
+                is_read=log_survey.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
+            )
             for name, t in sorted(watch.times.items())
         ],
         lacks=find_lacks(
@@ -336,13 +343,13 @@ def check_log(
     )
 
 
-def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    cameras = camera_topics(log, found, options)
+def _chosen(log: RawLog, log_survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
+    cameras = camera_topics(log, log_survey, options)
     names = tuple(camera.name for camera in cameras)
     if not names:
         return ()
     refuse_unknown_cameras(log.path, (*(options.cameras or ()), *options.camera_poses, *options.intrinsics), names)
-    check_mask_topics(log.path, found, options.human_topics, names)
+    check_mask_topics(log.path, log_survey, options.human_topics, names)
     return tuple(c for c in cameras if options.cameras is None or c.name in options.cameras)
 
 
@@ -350,42 +357,42 @@ def _findings(
     log: RawLog,
     options: SourceOptions,
     watch: LogWatch,
-    found: Survey,
+    log_survey: Survey,
     rig: Sequence[tuple[CameraTopics, Camera | None]],
 ) -> list[Finding]:
     where, cameras = log.path.name, [topics for topics, _ in rig]
     used = {name for camera in cameras for name in (camera.color, camera.depth)}
     unused = watch.images.keys() - used if cameras else set()
     findings = [
-        *damage_findings(where, found.damage.notes),
-        *(note("remark", where, text, value=num) for text, num in found.damage.remarks.items()),
+        *damage_findings(where, log_survey.damage.notes),
+        *(note("remark", where, text, value=num) for text, num in log_survey.damage.remarks.items()),
         *file_findings(watch.spans),
-        *_time_findings(watch, found, cameras, unused),
-        *_image_findings(watch, unused, {t.topic.name for t in image_topics(found, "unlike")}),
-        *calibration_findings(found, cameras, watch.changed_infos),
-        *tf_findings(found, cameras, options),
-        *chain.from_iterable(camera_findings(found, topics, camera, options) for topics, camera in rig),
+        *_time_findings(watch, log_survey, cameras, unused),
+        *_image_findings(watch, unused, {t.topic.name for t in image_topics(log_survey, "unlike")}),
+        *calibration_findings(log_survey, cameras, watch.changed_infos),
+        *tf_findings(log_survey, cameras, options),
+        *chain.from_iterable(camera_findings(log_survey, topics, camera, options) for topics, camera in rig),
     ]
     if any(finding.code == "pose-missing" for finding in findings):
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
-    if found.num_messages:
-        lacks = [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
+    if log_survey.num_messages:
+        lacks = [lack for lack in missing(log, log_survey, options) if not any(words in lack for words in SAID)]
     else:
-        damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
+        damage = "nothing usable before the damage" if log_survey.damage.count else "the log holds no messages"
         lacks = [f"{damage}; record it again, or give another file"]
     parts = (lack.rpartition("; ") for lack in lacks)
     return [*findings, *(error("missing", where, what or last, last if what else "") for what, _, last in parts)]
 
 
-def _span(found: Survey) -> tuple[int, int]:
-    entries = [t for t in found.topics.values() if t.count]
+def _span(log_survey: Survey) -> tuple[int, int]:
+    entries = [t for t in log_survey.topics.values() if t.count]
     return min((t.first_log_ns for t in entries), default=0), max((t.last_log_ns for t in entries), default=0)
 
 
 def _time_findings(
-    watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics], unused: Collection[str]
+    watch: LogWatch, log_survey: Survey, cameras: Sequence[CameraTopics], unused: Collection[str]
 ) -> list[Finding]:
-    names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
+    names = [n for n, e in sorted(log_survey.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
     times = [watch.times[n] for n in names if n in watch.times and n not in unused]
     each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
     each += [
@@ -396,8 +403,8 @@ def _time_findings(
     last_ns = max((t.last_ns for t in times if t.topic in watch.images), default=0)
     peers = [[watch.times[getattr(camera, kind)] for camera in cameras] for kind in ("color", "depth")]
     clocks = clock_findings(times)
-    said = {finding.where for finding in clocks if finding.code == "clock-offset"}
-    clocks += [f for topics in peers for f in peer_findings(topics) if f.where not in said]
+    topics_off = {finding.where for finding in clocks if finding.code == "clock-offset"}
+    clocks += [f for topics in peers for f in peer_findings(topics) if f.where not in topics_off]
     return [
         *join_gaps(each),
         *(part_findings(times) if not any(f.code in {"clock", "clock-offset"} for f in clocks) else ()),

@@ -237,18 +237,18 @@ class RobotStates:
     findings: Sequence[Finding] = ()
 
 
-def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
+def log_states(survey: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
     findings: list[Finding] = []
-    for topic in found.select_types(*STATE_TYPES):
+    for topic in survey.select_types(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
             for stream in topic.joints.streams.values():
                 findings += stream_findings(topic.topic.name, stream)
     loss = LossReport()
-    wanted = None if model is None else model.joint_names
+    joints = None if model is None else model.joint_names
     try:
-        if topics := state_topics(found, options, LossReport()):
-            refuse_contradiction(topics, wanted)
-        names, states = joint_records(found, options, loss, wanted)
+        if topics := state_topics(survey, options, LossReport()):
+            refuse_contradiction(topics, joints)
+        names, states = joint_records(survey, options, loss, joints)
     except (InputError, NotEvaluableError) as wrong:
         findings.append(error("joints", JOINT_STATES, wrong.message, wrong.remedy))
         return RobotStates(model=model, lack=str(wrong), findings=findings)
@@ -337,8 +337,8 @@ def robot_findings(model: RobotModel, states: Sequence[JointState]) -> list[Find
     severity = NOTE if agreement.verdict in {"agree", "tool"} else ERROR
     remedy = "" if severity is NOTE else "give the URDF of this very robot, and its --base"
     value = 1e3 * agreement.difference.median_position
-    found = judge(severity, "end-effector", JOINT_STATES, agreement.sentence, remedy, value=value, unit="mm")
-    return [*_limits(model, states, JOINT_STATES), *found]
+    findings = judge(severity, "end-effector", JOINT_STATES, agreement.sentence, remedy, value=value, unit="mm")
+    return [*_limits(model, states, JOINT_STATES), *findings]
 
 
 def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list[Finding]:

@@ -154,13 +154,13 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
 
 def join_gaps(findings: list[Finding]) -> list[Finding]:
     """Findings, with common pauses of topics and transforms joined."""
-    kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
+    others = [f for f in findings if f.code not in {"gap", "tf-gap"}]
     groups: list[list[Finding]] = []
     for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
         group = next((g for g in groups if _overlap(g[0], finding)), [])
         groups += [] if group else [group]
         group.append(finding)
-    return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *kept]
+    return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *others]
 
 
 def _overlap(a: Finding, b: Finding) -> bool:

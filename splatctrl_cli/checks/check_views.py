@@ -80,15 +80,15 @@ def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -
     together = _best_scale(views, pairs, cameras)
     if together is not None:
         return dict.fromkeys(cameras, together)
-    found = {}
+    scales = {}
     plain = {camera: _cost(views, _with(views, pairs, camera))[1] for camera in cameras}
     for camera in cameras if len(cameras) > 1 else []:
         if plain[camera] > max(limits.MOVE_GOOD_SHARE, 0.7 * max(plain.values())):
             continue
         scale = _best_scale(views, _with(views, pairs, camera), [camera])
         if scale is not None:
-            found[camera] = scale
-    return found if 2 * len(found) <= len(cameras) else {}  # else the factors only chase each other
+            scales[camera] = scale
+    return scales if 2 * len(scales) <= len(cameras) else {}  # else the factors only chase each other
 
 
 def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> list[Move]:
@@ -97,13 +97,13 @@ def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) ->
     moves: list[Move] = []
     for _ in range(max(1, len(cameras) // 2)):
         left = [camera for camera in cameras if camera not in {move.camera for move in moves}]
-        found = [(camera, T) for camera in left if (T := _fitted(views, pairs, camera)) is not None]
-        if not found:
+        fitted = [(camera, T) for camera in left if (T := _fitted(views, pairs, camera)) is not None]
+        if not fitted:
             break
         before = _cost(views, pairs)
-        costs = [_cost(_moved(views, {camera: T}), pairs) for camera, T in found]
+        costs = [_cost(_moved(views, {camera: T}), pairs) for camera, T in fitted]
         best = int(np.argmin([cost for cost, _ in costs]))
-        camera, T = found[best]
+        camera, T = fitted[best]
         its = _with(views, pairs, camera)
         own_before, own_after = _cost(views, its)[0], _cost(_moved(views, {camera: T}), its)
         move = Move(
@@ -308,8 +308,8 @@ def _fitting(
 def _fitted(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
     is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
     starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
-    found = [T for widths in starts if (T := _descend(views, pairs, camera, widths)) is not None]
-    return min(found, key=lambda T: _cost(_moved(views, {camera: T}), pairs)[0], default=None)
+    poses = [T for widths in starts if (T := _descend(views, pairs, camera, widths)) is not None]
+    return min(poses, key=lambda T: _cost(_moved(views, {camera: T}), pairs)[0], default=None)
 
 
 def _descend(

@@ -210,16 +210,16 @@ def _pixel_scores(
 ) -> Float64:
     number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
     is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
-    wanted = np.unique(number[is_inside])
+    pixels = np.unique(number[is_inside])
     depth = silhouettes(
-        _at(seconds, robot[0].reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3), robot[1], camera
+        _at(seconds, robot[0].reshape(len(seconds), -1), pixels * step).reshape(len(pixels), -1, 3), robot[1], camera
     )
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
     for i, inside in enumerate(is_inside):
         keep = _trim(inside)
         if keep.any():
-            of = np.searchsorted(wanted, number[i])
+            of = np.searchsorted(pixels, number[i])
             a, b = depth[of[:-1][keep]], depth[of[1:][keep]]
             scores[i] = correlation(predicted_change(a, b), changes[keep])
     return scores

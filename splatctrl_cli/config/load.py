@@ -86,11 +86,13 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
     Raises UsageError for unknown sections or keys (naming the nearest), wrong types or ranges, contradictions, or
     invalid TOML; InputError for a missing file.
     """
-    given: dict[str, dict[str, Any]] = {}
+    by_section: dict[str, dict[str, Any]] = {}
     for where, section, values in _tables(path, assignments):
-        given.setdefault(section, {}).update(_convert(where, section, values))
+        by_section.setdefault(section, {}).update(_convert(where, section, values))
     default = Config()
-    return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
+    return replace(
+        default, **{name: replace(getattr(default, name), **values) for name, values in by_section.items()}
+    )
 
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:

@@ -64,10 +64,10 @@ T = TypeVar("T")
 
 def copy_unchecked(original: T, **values: Any) -> T:
     """A copy with unchecked values from a recording, in their units."""
-    made = copy.copy(original)
+    copied = copy.copy(original)
     for key, value in values.items():
-        object.__setattr__(made, key, value)
-    return made
+        object.__setattr__(copied, key, value)
+    return copied
 
 
 class Section:

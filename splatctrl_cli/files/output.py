@@ -63,11 +63,11 @@ class Parts:
         """Return the path. Raises InputError if the file is not as written."""
         if self.digests is None:
             return path
-        found, said = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
-        wanted = require(found, said, remedy=self.remedy)
+        listed, what = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
+        digest = require(listed, what, remedy=self.remedy)
         refuse_if(not path.is_file(), f"{path}: missing; it was listed", remedy=self.remedy)
         refuse_if(
-            sha256(path) != wanted, f"{path}: was changed after it was written (another sha256)", remedy=self.remedy
+            sha256(path) != digest, f"{path}: was changed after it was written (another sha256)", remedy=self.remedy
         )
         return path
 

@@ -21,8 +21,8 @@ T = TypeVar("T")
 
 def scratch_folder() -> Path:
     """Folder for unnamed files: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else any."""
-    given, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
-    return Path(tempfile.gettempdir()) if given or not os.access(on_disk, os.W_OK) else on_disk
+    folder, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
+    return Path(tempfile.gettempdir()) if folder or not os.access(on_disk, os.W_OK) else on_disk
 
 
 def ranges(num: int) -> Iterator[tuple[int, int]]:
@@ -118,8 +118,8 @@ class Rows:
 
     def select(self, index: Index | None = None, columns: Index | None = None) -> "Rows":
         """Rows of an index (K,), and of columns, in their order."""
-        wanted = ((self._index, index), (self._columns, columns))
-        return Rows(self._file, *(old if new is None else new if old is None else old[new] for old, new in wanted))
+        choices = ((self._index, index), (self._columns, columns))
+        return Rows(self._file, *(old if new is None else new if old is None else old[new] for old, new in choices))
 
     def _read(self, first: int, last: int) -> Float64:
         if self._index is None:

@@ -59,12 +59,12 @@ def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) 
         chosen = (
             [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")] if names is None else names
         )
-        left, found = most, {}
+        left, arrays = most, {}
         for name in dict.fromkeys(chosen):
             with archive.open(f"{name}.npy") as member:
-                found[name] = _array(member, f"{name}: ", archive.getinfo(f"{name}.npy").file_size, left)
-            left -= found[name].nbytes
-    return found
+                arrays[name] = _array(member, f"{name}: ", archive.getinfo(f"{name}.npy").file_size, left)
+            left -= arrays[name].nbytes
+    return arrays
 
 
 def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
@@ -150,9 +150,9 @@ class ArrayFile(ABC):
         """
         headers = [self._checked(name) for name in names]
         lengths = [shape[0] for shape, _ in headers]
-        said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
+        texts = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
         refuse_if(
-            len(set(lengths)) > 1, f"{self.path}: expected arrays of one length, got {said}", remedy="check the file"
+            len(set(lengths)) > 1, f"{self.path}: expected arrays of one length, got {texts}", remedy="check the file"
         )
         widths = [prod(shape[1:]) for shape, _ in headers]
         parts = [  # how many rows its blocks have is its own
@@ -195,9 +195,9 @@ class ArrayFile(ABC):
     def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
         header = self._header(name)
         if header is None or header[1].kind not in kinds or not header[0]:
-            found = "none" if header is None else f"{header[1]} of shape {header[0]}"
+            actual = "none" if header is None else f"{header[1]} of shape {header[0]}"
             raise InputError(
-                f"{self.path}: {name!r}: expected an array of numbers, got {found}",
+                f"{self.path}: {name!r}: expected an array of numbers, got {actual}",
                 remedy=f"arrays there: {', '.join(self.names)}",
             )
         size = prod(header[0]) * header[1].itemsize
@@ -277,9 +277,9 @@ class Hdf5File(ArrayFile):
         """Raises InputError for another kind of file."""
         super().__init__(path)
         self._h5py = import_extra("h5py", _EXTRA, "HDF5 files")
-        self.names = found = list[str]()
+        self.names = names = list[str]()
         with self._opened() as file:
-            file.visititems(lambda name, item: found.append(name) if isinstance(item, self._h5py.Dataset) else None)
+            file.visititems(lambda name, item: names.append(name) if isinstance(item, self._h5py.Dataset) else None)
 
     def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
         name = name.strip("/")

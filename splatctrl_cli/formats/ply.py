@@ -96,11 +96,11 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     """
     content = read_bytes(path)
     form, elements, comments, length = _parse_header(path, content)
-    wanted = require(
-        next((found for found in elements if found.name == element), None),
-        f"{path}: expected an element {element}, got {[found.name for found in elements]}",
+    chosen = require(
+        next((other for other in elements if other.name == element), None),
+        f"{path}: expected an element {element}, got {[other.name for other in elements]}",
     )
-    names = [name for name, _ in wanted.properties]
+    names = [name for name, _ in chosen.properties]
     refuse_if(
         "packed_position" in names,
         f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
@@ -108,7 +108,7 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     )
     check_properties(path, names, required)
     read = _read_ascii if form == "ascii" else _read_binary
-    return PlyFile(path=path, rows=read(path, content, form, elements, length, wanted), comments=tuple(comments))
+    return PlyFile(path=path, rows=read(path, content, form, elements, length, chosen), comments=tuple(comments))
 
 
 def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
@@ -143,37 +143,37 @@ def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
 
 
 def _read_binary(
-    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
+    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, chosen: _Element
 ) -> Array:
     byte_order, start, end = BYTE_ORDERS[form], 0, length
-    dtype = wanted.dtype(path, byte_order)
-    for found in elements:
-        start, end = end if found is wanted else start, found.end(content, end, byte_order)
+    dtype = chosen.dtype(path, byte_order)
+    for element in elements:
+        start, end = end if element is chosen else start, element.end(content, end, byte_order)
     what = "cut short" if len(content) < end else "longer than its header says"
     refuse_if(
         len(content) != end,
         f"{path}: {what}: expected {end} bytes ({length} of header and the data it promises), got {len(content)}",
         remedy="copy or write the file again",
     )
-    return np.frombuffer(content, dtype, count=wanted.count, offset=start)
+    return np.frombuffer(content, dtype, count=chosen.count, offset=start)
 
 
 def _read_ascii(
-    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, wanted: _Element
+    path: Path, content: bytes, form: str, elements: Sequence[_Element], length: int, chosen: _Element
 ) -> Array:
     lines = [line.split() for line in content[length:].split(b"\n") if line.strip()]
-    expected = sum(found.count for found in elements if found.properties)
+    expected = sum(element.count for element in elements if element.properties)
     refuse_if(len(lines) != expected, f"{path}: expected {expected} lines of data, got {len(lines)}")
-    start = sum(found.count for found in elements[: elements.index(wanted)] if found.properties)
-    rows = lines[start : start + wanted.count]
-    table = np.zeros(wanted.count, dtype=wanted.dtype(path, BYTE_ORDERS[form]))
-    bad = next((i for i, row in enumerate(rows) if len(row) != len(wanted.properties)), None)
+    start = sum(element.count for element in elements[: elements.index(chosen)] if element.properties)
+    rows = lines[start : start + chosen.count]
+    table = np.zeros(chosen.count, dtype=chosen.dtype(path, BYTE_ORDERS[form]))
+    bad = next((i for i, row in enumerate(rows) if len(row) != len(chosen.properties)), None)
     if bad is not None:
         raise InputError(
-            f"{path}: {wanted.name} {bad}: expected {len(wanted.properties)} numbers, got {len(rows[bad])}"
+            f"{path}: {chosen.name} {bad}: expected {len(chosen.properties)} numbers, got {len(rows[bad])}"
         )
-    for index, (name, _) in enumerate(wanted.properties):
-        with refuse_faults(f"{path}: {wanted.name}: property {name}", ValueError, OverflowError):
+    for index, (name, _) in enumerate(chosen.properties):
+        with refuse_faults(f"{path}: {chosen.name}: property {name}", ValueError, OverflowError):
             table[name] = [float(row[index]) for row in rows]
     return table
 

@@ -157,17 +157,17 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     began = time.perf_counter()
     roots = check_postures(clearance, start, goals, config)
     search = _Search(clearance, config, (_Tree(roots[:1]), _Tree(roots[1:])), np.random.default_rng(seed), began)
-    outcome, found, goal = search.run()
+    outcome, path, goal = search.run()
     searched = time.perf_counter()
-    waypoints = found
+    waypoints = path
     if outcome is PlanOutcome.SOLVED:
-        waypoints, num_edges, num_checks = shorten_path(clearance, found, config, search.random)
+        waypoints, num_edges, num_checks = shorten_path(clearance, path, config, search.random)
         search.num_edges += num_edges
         search.num_checks += num_checks
     return Plan(
         outcome=outcome,
         waypoints=waypoints,
-        found=found,
+        found=path,
         goal=goal,
         num_iterations=search.num_iterations,
         num_edges=search.num_edges,
@@ -240,10 +240,10 @@ def _skip_waypoints(clearance: Clearance, path: Float64, config: PlannerConfig) 
         through = np.where(usable[:w, w], best[:w] + length[:w, w], np.inf)
         before[w] = int(np.argmin(through))
         best[w] = through[before[w]]
-    kept = [W - 1]
-    while kept[-1] > 0:
-        kept.append(int(before[kept[-1]]))
-    return path[kept[::-1]], len(a), num_checks
+    indices = [W - 1]
+    while indices[-1] > 0:
+        indices.append(int(before[indices[-1]]))
+    return path[indices[::-1]], len(a), num_checks
 
 
 def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float64:

@@ -155,19 +155,19 @@ def _find(
 ) -> tuple[PlanOutcome, Float64]:
     last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
     before = np.array([way[0] for way in last])
-    found = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
-    if not found.is_solved:
-        return found.outcome, found.waypoints
-    ending = last[int(np.argmin(np.linalg.norm(before - found.waypoints[-1], axis=1)))]
-    return found.outcome, np.concatenate([found.waypoints, ending[1:]])
+    nearest_plan = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
+    if not nearest_plan.is_solved:
+        return nearest_plan.outcome, nearest_plan.waypoints
+    ending = last[int(np.argmin(np.linalg.norm(before - nearest_plan.waypoints[-1], axis=1)))]
+    return nearest_plan.outcome, np.concatenate([nearest_plan.waypoints, ending[1:]])
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
     """A path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any."""
     nearest = goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
-    found = plan(room, start, nearest[:1], few, seed=planner.seed)
-    return found if found.is_solved else plan(room, start, nearest, planner, seed=planner.seed)
+    nearest_plan = plan(room, start, nearest[:1], few, seed=planner.seed)
+    return nearest_plan if nearest_plan.is_solved else plan(room, start, nearest, planner, seed=planner.seed)
 
 
 def approach_to(
@@ -232,14 +232,14 @@ def goal_postures(
 
     They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, perhaps 0.
     """
-    found: list[Float64] = []
+    postures: list[Float64] = []
     for guess in guesses:
         q = _solve(model, frame, T_world_goal, guess, config)
-        if q is not None and all(np.max(np.abs(q - other)) > fixed.GOAL_DISTINCT for other in found):
-            found.append(q)
-        if len(found) == at_most:
+        if q is not None and all(np.max(np.abs(q - other)) > fixed.GOAL_DISTINCT for other in postures):
+            postures.append(q)
+        if len(postures) == at_most:
             break
-    return np.array(found).reshape(-1, len(model.lower))
+    return np.array(postures).reshape(-1, len(model.lower))
 
 
 def _solve(

@@ -247,9 +247,9 @@ class Perturbation:
     seed: int = 0
 
     @classmethod
-    def of(cls, given: Mapping[str, float]) -> "Perturbation | None":
+    def of(cls, values: Mapping[str, float]) -> "Perturbation | None":
         """Build from values by name; None if they do nothing. Raises UsageError for an unknown name or value."""
-        for name, value in given.items():
+        for name, value in values.items():
             refuse_if(
                 name not in LIMITS,
                 f"--perturb {name}: expected one of {', '.join(LIMITS)}",
@@ -261,8 +261,8 @@ class Perturbation:
                 f"--perturb {name}: expected 0 to {LIMITS[name]:g}, got {value:g}",
                 error=UsageError,
             )
-        made = cls(**{name.replace("-", "_"): int(v) if name == "seed" else v for name, v in given.items()})  # type: ignore[arg-type]
-        return made if made.depth_noise or made.pose_error or made.pose_turn else None
+        perturbation = cls(**{name.replace("-", "_"): int(v) if name == "seed" else v for name, v in values.items()})  # type: ignore[arg-type]
+        return perturbation if perturbation.depth_noise or perturbation.pose_error or perturbation.pose_turn else None
 
     def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
         """Add noise to depth (H, W) [m]; 0 where none is or remains."""

@@ -161,8 +161,8 @@ def _yaml(path: Path, _head: bytes) -> Summary:
 
 
 def _image(path: Path, _head: bytes) -> Summary:
-    said = f"{path}: not an image that can be read"
-    pixels = require(decode_file(path.read_bytes(), color=False), said, remedy="the file is damaged")
+    what = f"{path}: not an image that can be read"
+    pixels = require(decode_file(path.read_bytes(), color=False), what, remedy="the file is damaged")
     return Summary(
         path=str(path),
         kind="image",
@@ -179,7 +179,7 @@ def _find(content: Any, key: str) -> Any:
         return None
     if key in content:
         return content[key]
-    return next((found for value in content.values() if (found := _find(value, key)) is not None), None)
+    return next((result for value in content.values() if (result := _find(value, key)) is not None), None)
 
 
 def _short(value: object) -> object:

@@ -83,17 +83,17 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
     """Path, topic or node, and text of logs' and captures' URDFs, each once."""
-    found: dict[str, tuple[Path, str, str]] = {}
+    by_text: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
-        said = []
+        descriptions = []
         if is_capture(path):
-            said = read_robot_description(path)
+            descriptions = read_robot_description(path)
         elif path.exists() and not has_views(path):
             with suppress(InputError):  # who reads it says why
-                said = robot_descriptions(open_raw_log(path))
-        for where, text in said:
-            found.setdefault(text, (path, where, text))
-    return list(found.values())
+                descriptions = robot_descriptions(open_raw_log(path))
+        for where, text in descriptions:
+            by_text.setdefault(text, (path, where, text))
+    return list(by_text.values())
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
@@ -136,43 +136,43 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     """Topics, times, frames, cameras, and what a reconstruction misses."""
-    found, sampling = survey_to_describe(log)
-    logged = [t for t in found.topics.values() if t.count]
+    survey, sampling = survey_to_describe(log)
+    logged = [t for t in survey.topics.values() if t.count]
     first, last = min((t.first_log_ns for t in logged), default=0), max((t.last_log_ns for t in logged), default=0)
     times = {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
-    frames = {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
-    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
-    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
+    frames = {"tf_frames": list(survey.tf.frames), "tf_roots": list(survey.tf.roots)}
+    joints = next((t.joints.first_names for t in survey.topics.values() if t.joints.first_names is not None), ())
+    robots = [name for name, t in sorted(survey.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
     facts: dict[str, object] = {
         "bytes": sum(file.stat().st_size for file in log.files),
-        "messages": found.num_messages,
+        "messages": survey.num_messages,
         **(times if logged else {}),
-        **(frames if found.tf.frames else {}),
+        **(frames if survey.tf.frames else {}),
         **({"joints": list(joints)} if joints else {}),
         **({ROBOT: robots} if robots else {}),
     }
-    rows = [_topic_row(found.topics[name]) for name in sorted(found.topics)]
+    rows = [_topic_row(survey.topics[name]) for name in sorted(survey.topics)]
     grids = [
         Grid(
             name="topics",
             header=("topic", "type", "encoding", "count", "hz", "first message"),
             rows=rows,
-            unused=[name for name, topic in found.topics.items() if _first(topic) == "-" and not _is_read(topic)],
+            unused=[name for name, topic in survey.topics.items() if _first(topic) == "-" and not _is_read(topic)],
         )
     ]
-    cameras = camera_topics(log, found, options)
+    cameras = camera_topics(log, survey, options)
     if cameras:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
         grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
-    lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
+    lacks = missing(log, survey, options) if survey.num_messages else ["the log holds no messages"]
     return Summary(
         path=str(log.path),
         kind=log.container,
         facts=facts,
         grids=tuple(grids),
         missing=tuple(lacks),
-        notes=(*sampling, *found.damage.all_notes, *found.tf.notes),
-        damaged=found.damage.count,
+        notes=(*sampling, *survey.damage.all_notes, *survey.tf.notes),
+        damaged=survey.damage.count,
     )
 
 

@@ -78,7 +78,7 @@ class SourceOptions:
 still_note = "camera {}: is fixed where --camera-pose puts it, not where the recording may say".format
 
 
-def refuse_unknown_cameras(where: Path, asked: Iterable[str], known: Collection[str]) -> None:
+def refuse_unknown_cameras(where: Path, requested: Iterable[str], known: Collection[str]) -> None:
     """Raise InputError for a requested camera not in the recording."""
-    for name in asked:
+    for name in requested:
         refuse_if(name not in known, f"{where}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")

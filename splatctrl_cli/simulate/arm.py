@@ -219,11 +219,11 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64,
         step = float(np.linalg.norm(end - start)) / steps
         grown = float(np.ceil(np.hypot(radius, step / 2) * 1e4) / 1e4)
         spheres += [(start + (end - start) * (i / steps), grown) for i in range(steps + 1)]
-    kept: list[tuple[Float64, float]] = []
+    outer: list[tuple[Float64, float]] = []
     for center, radius in sorted(spheres, key=lambda sphere: -sphere[1]):
-        if not any(np.linalg.norm(center - other) + radius <= big + 5e-4 for other, big in kept):
-            kept.append((center, radius))
-    return kept
+        if not any(np.linalg.norm(center - other) + radius <= big + 5e-4 for other, big in outer):
+            outer.append((center, radius))
+    return outer
 
 
 def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:

@@ -52,7 +52,7 @@ class RecordingOptions:
     color_rays: int = 4
 
     def __post_init__(self) -> None:
-        given, place = ",".join(f"{value:g}" for value in self.visitor), self.visitor
+        text, place = ",".join(f"{value:g}" for value in self.visitor), self.visitor
         is_placed = len(place) == 3 and 0.001 <= place[2] <= 1 and max(map(abs, place[:2])) <= 5
         num_frames = self.duration_s * self.fps
         rules = (
@@ -65,7 +65,7 @@ class RecordingOptions:
             (16 <= self.height <= 4096, f"--height: expected 16 to 4096 px, got {self.height}"),
             (self.noise in NOISES, f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}"),
             (not (self.is_free and self.with_person), "--free: expected no --person, who walks about the table"),
-            (is_placed, f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {given}"),
+            (is_placed, f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {text}"),
             (
                 place == tabletop.VISITOR or not (self.with_person or self.is_free),
                 "--visitor: expected no --person or --free",

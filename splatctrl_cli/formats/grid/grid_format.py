@@ -99,10 +99,10 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
     )
     shape = (cells[0], cells[1], cells[2])
     for channel, got in arrays.items():
-        wanted = (CHANNELS[channel].dtype, CHANNELS[channel].shape(shape))
+        expected = (CHANNELS[channel].dtype, CHANNELS[channel].shape(shape))
         refuse_if(
-            got != wanted,
-            f"{name}: {channel}: expected {wanted[0]} {wanted[1]}, got {got[0]} {got[1]}",
+            got != expected,
+            f"{name}: {channel}: expected {expected[0]} {expected[1]}, got {got[0]} {got[1]}",
             remedy="bake it again",
         )
     return shape
@@ -246,11 +246,11 @@ class GridSlabs:
         )
         num = len(slab[self.plan.channels[0]])
         for name in self.plan.channels:
-            wanted = (CHANNELS[name].dtype, CHANNELS[name].shape((num, *self.plan.shape[1:])))
+            expected = (CHANNELS[name].dtype, CHANNELS[name].shape((num, *self.plan.shape[1:])))
             values = slab[name]
             refuse_if(
-                (values.dtype.str, values.shape) != wanted or num + self.num_layers > self.plan.shape[0],
-                f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {wanted}, "
+                (values.dtype.str, values.shape) != expected or num + self.num_layers > self.plan.shape[0],
+                f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {expected}, "
                 f"got {(values.dtype.str, values.shape)}",
             )
             self._write_channel(name, values)
@@ -316,26 +316,26 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
         return start_slabs(folder, plan)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder / PROGRESS}: not readable: {error!r}", remedy="bake without --resume") from None
-    wanted = plan.as_dict()
-    differs = [key for key in wanted if left.get(key) != wanted[key]]
-    changes = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
+    expected = plan.as_dict()
+    differs = [key for key in expected if left.get(key) != expected[key]]
+    changes = ", ".join(_difference(key, left.get(key), expected[key]) for key in differs)
     refuse_if(differs, f"{folder}: cannot be continued: {changes}", remedy="bake without --resume", error=UsageError)
     for name in plan.channels:
         path = folder / f"{name}.npy"
         size = CHANNELS[name].shape(plan.shape)
         try:
-            found = np.lib.format.open_memmap(path, mode="r").shape
+            shape = np.lib.format.open_memmap(path, mode="r").shape
         except (OSError, ValueError):  # not there, or cut
-            found = ()
-        refuse_if(found != size, f"{path}: expected {size}, got no such array", remedy="bake without --resume")
+            shape = ()
+        refuse_if(shape != size, f"{path}: expected {size}, got no such array", remedy="bake without --resume")
     return GridSlabs(folder, plan, num_layers, counts)
 
 
-def _difference(key: str, left: object, wanted: object) -> str:
-    if isinstance(left, dict) and isinstance(wanted, dict):
-        names = sorted(name for name in {*left, *wanted} if left.get(name) != wanted.get(name))
-        return ", ".join(f"{name} was {left.get(name)!r}, is {wanted.get(name)!r}" for name in names)
-    return f"{key} was {left!r}, is {wanted!r}"
+def _difference(key: str, left: object, expected: object) -> str:
+    if isinstance(left, dict) and isinstance(expected, dict):
+        names = sorted(name for name in {*left, *expected} if left.get(name) != expected.get(name))
+        return ", ".join(f"{name} was {left.get(name)!r}, is {expected.get(name)!r}" for name in names)
+    return f"{key} was {left!r}, is {expected!r}"
 
 
 def _write_progress(folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int]) -> None:

@@ -44,11 +44,11 @@ def iso_surface(grid: DistanceGrid) -> Any:
         if not is_known.any():
             continue
         lowest, highest = min(lowest, float(slab[is_known].min())), max(highest, float(slab[is_known].max()))
-        found = _marching_cubes(slab, is_known)
-        if found is not None:
-            vertices.append(found[0] + (start, 0.0, 0.0))
-            faces.append(found[1].astype(np.int64) + count)
-            count += len(found[0])
+        part = _marching_cubes(slab, is_known)
+        if part is not None:
+            vertices.append(part[0] + (start, 0.0, 0.0))
+            faces.append(part[1].astype(np.int64) + count)
+            count += len(part[0])
     got = f"values from {lowest:.4g} to {highest:.4g} m" if lowest <= highest else "no cell that has a distance"
     refuse_if(
         not vertices,

@@ -47,21 +47,21 @@ def write_vdb(path: Path, grid: DistanceGrid) -> None:
     for name, values in grid.channels.items():
         is_vector = CHANNELS[name].components == 3
         background = 0.0 if is_vector else _above(values)
-        made = vdb.Vec3SGrid((0.0, 0.0, 0.0)) if is_vector else vdb.FloatGrid(background)
+        vdb_grid = vdb.Vec3SGrid((0.0, 0.0, 0.0)) if is_vector else vdb.FloatGrid(background)
         start = 0
         for layers in slabs(values):
             known = np.where(np.isnan(layers), np.float32(background), layers.astype(np.float32, copy=False))
-            made.copyFromArray(known, ijk=(start, 0, 0))
+            vdb_grid.copyFromArray(known, ijk=(start, 0, 0))
             start += len(layers)
-        made.transform = vdb.createLinearTransform(to_world)
-        made.name, made.creator = name, f"splatctrl {__version__}"
+        vdb_grid.transform = vdb.createLinearTransform(to_world)
+        vdb_grid.name, vdb_grid.creator = name, f"splatctrl {__version__}"
         if name in {"sdf", "hard", "se", "gpdf"}:
-            made.gridClass = vdb.GridClass.LEVEL_SET
+            vdb_grid.gridClass = vdb.GridClass.LEVEL_SET
         if is_vector:
-            made.vectorType = vdb.VectorType.COVARIANT
+            vdb_grid.vectorType = vdb.VectorType.COVARIANT
         for key, value in metadata.items():
-            made[key] = value
-        grids.append(made)
+            vdb_grid[key] = value
+        grids.append(vdb_grid)
     vdb.write(str(path), grids=grids, metadata={"creator": f"splatctrl {__version__}"})
     with path.open("r+b") as stream:
         stream.seek(_UUID_AT)
@@ -129,16 +129,16 @@ def _text(stream: BinaryIO) -> str:
 
 
 def _metadata(stream: BinaryIO) -> dict[str, object]:
-    found: dict[str, object] = {}
+    metadata: dict[str, object] = {}
     for _ in range(_unpack(stream, "<I")[0]):
         name, kind = _text(stream), _text(stream)
         if kind in _NUMBERS:
             stream.read(4)  # its length
-            (found[name],) = _unpack(stream, _NUMBERS[kind])
+            (metadata[name],) = _unpack(stream, _NUMBERS[kind])
         else:
             text = _text(stream)
-            found[name] = text if kind == "string" else f"{kind} of {len(text)} bytes"
-    return found
+            metadata[name] = text if kind == "string" else f"{kind} of {len(text)} bytes"
+    return metadata
 
 
 def describe_vdb(path: Path, head: bytes) -> Summary | None:

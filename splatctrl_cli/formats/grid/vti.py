@@ -158,10 +158,10 @@ def _values(path: Path, stream: BinaryIO, grid: DistanceGrid, name: str, start: 
     stream.seek(start)
     zeros = grid.channels[name]
     (x, y, z), size = zeros.shape[:3], zeros.size * zeros.itemsize
-    there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - start - 8)
+    num_bytes = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - start - 8)
     refuse_if(
-        there != size,
-        f"{path}: {name}: expected {size} bytes, got {max(there, 0)}",
+        num_bytes != size,
+        f"{path}: {name}: expected {size} bytes, got {max(num_bytes, 0)}",
         remedy="the file is cut; bake it again",
     )
     planes: Values = np.fromfile(stream, zeros.dtype, zeros.size).reshape(z, y, x, *zeros.shape[3:])
@@ -177,8 +177,8 @@ def describe_vti(path: Path, head: bytes) -> Summary | None:
     if path.suffix != ".vti" and b'type="ImageData"' not in head[:512]:
         return None
     text = head.decode("latin-1")
-    found, said = re.search(r"<ImageData\b([^>]*)>", text), f"{path}: a .vti without ImageData"
-    image = require(found, said, remedy="the file is damaged")
+    match, what = re.search(r"<ImageData\b([^>]*)>", text), f"{path}: a .vti without ImageData"
+    image = require(match, what, remedy="the file is damaged")
     codes = re.search(r'<Array type="String"[^>]*>([\d\s]+)</Array>', text)  # the string, written as numbers
     if codes and FORMAT in bytes(int(code) % 256 for code in codes[1].split()).decode("utf-8", "replace"):
         return summary_of(path, "ParaView image data", read_vti(path, with_values=False))

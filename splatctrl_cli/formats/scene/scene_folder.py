@@ -106,9 +106,9 @@ def run_value(
             value = value[key]
         return kind(value)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        said = "nothing" if isinstance(error, KeyError) else str(error)
+        actual = "nothing" if isinstance(error, KeyError) else str(error)
         raise InputError(
-            f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {said}",
+            f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {actual}",
             remedy="reconstruct the scene again",
         ) from None
 
@@ -259,7 +259,7 @@ class SceneFolder:
             refuse_faults(f"{path}: cannot be read", OSError, KeyError, ValueError, TypeError, csv.Error),
             path.open(encoding="utf-8", newline="") as stream,
         ):
-            taken = tuple(
+            snapshots = tuple(
                 Snapshot(
                     stamp_ns=int(row["stamp_ns"]),
                     path=self.path / _inside(row["file"]),
@@ -268,13 +268,13 @@ class SceneFolder:
                 )
                 for row in csv.DictReader(stream)
             )
-        for before, after in pairwise(taken):
+        for before, after in pairwise(snapshots):
             refuse_if(
                 after.stamp_ns <= before.stamp_ns,
                 f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
                 remedy="reconstruct the scene again",
             )
-        return taken
+        return snapshots
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:
         """The newest snapshot up to `stamp_ns`. Raises NotEvaluableError before the first."""
@@ -340,12 +340,12 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def _content(self) -> SplatSet | GaussianSet:
-        found, comments = read_splats(self.path)
+        splats, comments = read_splats(self.path)
         check_world(self.path, comments)
         refuse_if(
-            not len(found), f"{self.path}: has no splats: there is nothing to render", remedy="give another file"
+            not len(splats), f"{self.path}: has no splats: there is nothing to render", remedy="give another file"
         )
-        return found
+        return splats
 
     def gaussians(self) -> GaussianSet:
         assert isinstance(self._content, GaussianSet)

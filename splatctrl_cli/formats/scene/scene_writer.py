@@ -84,21 +84,21 @@ class SceneWriter:
             for index, (stamp_ns, num_splats) in enumerate(checkpoint.snapshots)
         ]
         self._num_flushed = len(self.snapshots)
-        kept = {self._audit, self.folder / CHECKPOINT}
-        kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
-        kept |= {self.folder / name for name in checkpoint.parts or {}}
-        missing = sorted(path.name for path in kept if not path.is_file())
+        files = {self._audit, self.folder / CHECKPOINT}
+        files |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
+        files |= {self.folder / name for name in checkpoint.parts or {}}
+        missing = sorted(path.name for path in files if not path.is_file())
         refuse_if(
             missing or self._audit.stat().st_size < checkpoint.audit_bytes,
             f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it",
             remedy=START_OVER,
         )
         written = Parts(folder=self.folder, digests=checkpoint.parts, remedy=START_OVER)
-        for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
+        for path in sorted(files - {self._audit, self.folder / CHECKPOINT}):
             written.checked(path)
         self._digests = dict(checkpoint.parts or {})
         for path in sorted(self.folder.rglob("*")):
-            if path not in kept and not path.is_dir():
+            if path not in files and not path.is_dir():
                 path.unlink()
         with self._audit.open("r+b") as stream:
             stream.truncate(checkpoint.audit_bytes)

@@ -210,10 +210,10 @@ def _edges(arrays: Arrays) -> LostEdges:
 
 
 def _voxels(values: Array, name: str, kind: type[np.generic], header: Mapping[str, Any]) -> Array:
-    wanted = (np.dtype(kind), tuple(header["shape"]))
+    expected = (np.dtype(kind), tuple(header["shape"]))
     refuse_if(
-        (values.dtype, values.shape) != wanted or len(values.shape) != 3,
-        f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}",
+        (values.dtype, values.shape) != expected or len(values.shape) != 3,
+        f"{name}: expected {expected[0]} {expected[1]}, got {values.dtype} {values.shape}",
         error=ValueError,
     )
     return values

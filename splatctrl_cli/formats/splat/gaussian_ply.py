@@ -271,14 +271,14 @@ def log_sigmas(ply: PlyFile) -> Float64:
 
     They are none if no scale is below 0 and 95 % of splats exceed SPARSEST times their spacing.
     """
-    found = [name for name in SCALES if name in ply.names]
+    names = [name for name in SCALES if name in ply.names]
     refuse_if(
-        len(found) == 2,
-        f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(found)}: the flat splats of"
+        len(names) == 2,
+        f"{ply.path}: expected scale_0 alone or scale_0 to scale_2, got {' and '.join(names)}: the flat splats of"
         " 2D-GS have no third sigma",
         remedy="write the log of a thickness [m] as scale_2",
     )
-    logs = np.column_stack([ply.column(name if len(found) == 3 else "scale_0") for name in SCALES])
+    logs = np.column_stack([ply.column(name if len(names) == 3 else "scale_0") for name in SCALES])
     if len(ply) < 2 or logs.min() < 0:
         return logs
     centers = exact_centers(ply)

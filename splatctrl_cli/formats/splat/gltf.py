@@ -177,13 +177,18 @@ def _primitive(path: Path, document: Mapping[str, Any]) -> dict[str, Any]:
         AttributeError,
     ):
         primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
-        found = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]
-        names = [name for primitive in found for name in primitive["extensions"][EXTENSION].get("extensions", {})]
+        splat_primitives = [primitive for primitive in primitives if EXTENSION in primitive.get("extensions", {})]
+        names = [
+            name
+            for primitive in splat_primitives
+            for name in primitive["extensions"][EXTENSION].get("extensions", {})
+        ]
     refuse_if(
-        len(found) != 1, f"{path}: expected one primitive with {EXTENSION}, got {len(found)} of {len(primitives)}"
+        len(splat_primitives) != 1,
+        f"{path}: expected one primitive with {EXTENSION}, got {len(splat_primitives)} of {len(primitives)}",
     )
     refuse_if(names, f"{path}: its Gaussians are packed by {''.join(names[:1])}, expected plain attributes")
-    primitive: dict[str, Any] = found[0]
+    primitive: dict[str, Any] = splat_primitives[0]
     kernel = primitive["extensions"][EXTENSION].get("kernel")
     refuse_if(
         kernel != PROPERTIES["kernel"],

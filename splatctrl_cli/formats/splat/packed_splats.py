@@ -46,11 +46,11 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
-    held = held_by_splat(gaussians)
-    rows["center"], rows["sigma"] = held.centers, held.scales
-    rows["rgba"][:, :3] = np.rint(255.0 * (0.5 + SH_C0 * held.harmonics[:, 0].astype(np.float64)))
-    rows["rgba"][:, 3] = np.rint(255.0 * held.opacities.astype(np.float64))
-    quats = held.quats_wxyz.astype(np.float64)
+    clipped = held_by_splat(gaussians)
+    rows["center"], rows["sigma"] = clipped.centers, clipped.scales
+    rows["rgba"][:, :3] = np.rint(255.0 * (0.5 + SH_C0 * clipped.harmonics[:, 0].astype(np.float64)))
+    rows["rgba"][:, 3] = np.rint(255.0 * clipped.opacities.astype(np.float64))
+    quats = clipped.quats_wxyz.astype(np.float64)
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
     rows["quat_wxyz"] = np.rint(128.0 - 128.0 * np.copysign(quats, quats * largest))
     path.write_bytes(rows.tobytes())
@@ -108,17 +108,17 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
-    held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[held.harmonics.shape[1]]
-    fixed = np.rint(np.ldexp(held.centers.astype(np.float64), bits)).astype("<i4")
+    clipped, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[clipped.harmonics.shape[1]]
+    fixed = np.rint(np.ldexp(clipped.centers.astype(np.float64), bits)).astype("<i4")
     parts = [
-        HEADER.pack(MAGIC, 3, len(held), degree, bits, 0, 0),
+        HEADER.pack(MAGIC, 3, len(clipped), degree, bits, 0, 0),
         fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-        np.rint(255.0 * held.opacities.astype(np.float64)).astype(np.uint8).tobytes(),
-        np.rint(held.harmonics[:, 0] * COLOR_SCALE + 127.5).astype(np.uint8).tobytes(),
-        np.rint(16.0 * (np.log(held.scales.astype(np.float64)) + 10.0)).astype(np.uint8).tobytes(),
-        _packed_quaternions(held.quats_wxyz).tobytes(),
-        np.rint(128.0 * held.harmonics[:, 1:] + 128.0).astype(np.uint8).tobytes(),
+        np.rint(255.0 * clipped.opacities.astype(np.float64)).astype(np.uint8).tobytes(),
+        np.rint(clipped.harmonics[:, 0] * COLOR_SCALE + 127.5).astype(np.uint8).tobytes(),
+        np.rint(16.0 * (np.log(clipped.scales.astype(np.float64)) + 10.0)).astype(np.uint8).tobytes(),
+        _packed_quaternions(clipped.quats_wxyz).tobytes(),
+        np.rint(128.0 * clipped.harmonics[:, 1:] + 128.0).astype(np.uint8).tobytes(),
     ]
     path.write_bytes(gzip.compress(b"".join(parts), compresslevel=6, mtime=0))
 

@@ -131,10 +131,10 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
     """Raise InputError for comments of another unit or frame, or a shell."""
     check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
-        said = comments.get(key)
+        comment = comments.get(key)
         refuse_if(
-            said is not None and said.lower() not in known,
-            f"{path}: comment '{key}: {said}': expected {known[0]}",
+            comment is not None and comment.lower() not in known,
+            f"{path}: comment '{key}: {comment}': expected {known[0]}",
             remedy="distances are in metres in the world: transform the splats, and correct the comment",
         )
 
@@ -207,8 +207,8 @@ FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(_
 
 def format_of(path: Path, error: type[SplatCtrlError] = UsageError) -> SplatFormat:
     """The suffix's format, PLY without one. Raises `error` if unknown."""
-    said = f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}"
-    return require(FORMATS.get(path.suffix.lower() or ".ply"), said, error=error)
+    what = f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}"
+    return require(FORMATS.get(path.suffix.lower() or ".ply"), what, error=error)
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
@@ -261,17 +261,17 @@ def read_spheres(path: Path) -> SplatSet:
     """
     if (path.suffix.lower() or ".ply") == ".ply":
         return read_world_splats(path)
-    found, comments = read_splats(path)
+    splats, comments = read_splats(path)
     check_world(path, comments)
-    if isinstance(found, GaussianSet):
-        found = as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
-    return found
+    if isinstance(splats, GaussianSet):
+        splats = as_splats(replace(splats, harmonics=splats.harmonics[:, :1]), str(path))
+    return splats
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
     """Summarise a splat file. Raises InputError for another kind."""
-    found, comments = read_splats(path)
-    gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    splats, comments = read_splats(path)
+    gaussians = as_gaussians(splats) if isinstance(splats, SplatSet) else splats
     ranges: dict[str, Floats] = (
         {}
         if not len(gaussians)
@@ -286,7 +286,7 @@ def describe_splats(path: Path, _head: bytes) -> Summary:
     facts: dict[str, object] = {
         "format": format_of(path).name,
         "splats": len(gaussians),
-        "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
+        "shape": "isotropic" if isinstance(splats, SplatSet) else "anisotropic",
         "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
         **({"labels": labels} if (gaussians.labels != Label.OBJECT).any() else {}),
         **{name: [float(f"{value:.4g}") for value in values] for name, values in ranges.items()},

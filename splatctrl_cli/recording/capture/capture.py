@@ -244,12 +244,12 @@ class CaptureSource(FrameSource):
             options.refuse(("joint_topic",), "the states of one topic in a capture", path)
             self.states = _read_joints(path) if self.joint_names else NO_STATES
         else:
-            kept, loss = self.joint_topics, LossReport()
-            found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
-            chosen = options if options.joint_topic is not None else replace(options, joint_topic=kept.chosen)
-            self.joint_names, self.states = joint_records(found, chosen, loss, joints)
+            topics, loss = self.joint_topics, LossReport()
+            survey = Survey(topics={topic.topic.name: topic for topic in topics.topics})
+            chosen = options if options.joint_topic is not None else replace(options, joint_topic=topics.chosen)
+            self.joint_names, self.states = joint_records(survey, chosen, loss, joints)
             self._loss = merge_joints(
-                merge_joints(self._loss, kept.loss, kept.first_note, sign=-1), loss, kept.first_note
+                merge_joints(self._loss, topics.loss, topics.first_note, sign=-1), loss, topics.first_note
             )
 
     @property

@@ -61,9 +61,9 @@ class Journal:
         self._kept = self.entries()
 
     def next_kept(self) -> Entry | None:
-        found = next(self._kept, None)
-        self.num_entries += found is not None
-        return found
+        entry = next(self._kept, None)
+        self.num_entries += entry is not None
+        return entry
 
     def add(self, entry: Entry) -> None:
         self.num_entries += 1
@@ -125,14 +125,14 @@ def write_capture(
         if isinstance(item, JointState):
             states.add(item)
             continue
-        row, kept = _row(item, cameras), journal.next_kept()
-        if kept is None:
+        row, entry = _row(item, cameras), journal.next_kept()
+        if entry is None:
             journal.add(_write_frame(folder, item, row, cameras[item.camera]))
         else:
-            name = next((name for name in row if kept.row.get(name) != row[name]), "")
+            name = next((name for name in row if entry.row.get(name) != row[name]), "")
             refuse_if(
                 name,
-                f"{folder}: --resume: {kept.row.get('color')}: {name} was {kept.row.get(name)}, is {row.get(name)}",
+                f"{folder}: --resume: {entry.row.get('color')}: {name} was {entry.row.get(name)}, is {row.get(name)}",
                 remedy="the source has changed; start over without --resume",
                 error=UsageError,
             )
@@ -255,14 +255,14 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
 
 
 def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
-    found = {"color": color, "depth": depth} if stored.places else {}
+    messages = {"color": color, "depth": depth} if stored.places else {}
     for kind, place in zip(("color", "depth"), stored.places, strict=False):
-        found |= {
+        messages |= {
             f"{kind}_file": place.file,
             f"{kind}_offset": "" if place.offset < 0 else str(place.offset),
             f"{kind}_log_time_ns": str(place.log_time_ns),
         }
-    return found
+    return messages
 
 
 def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:

@@ -100,15 +100,15 @@ class Bag1Log(RawLog):
                 )
 
     def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
-        told = fields_of(body)
-        if told is None or "topic" not in fields or "type" not in told:
+        connection = fields_of(body)
+        if connection is None or "topic" not in fields or "type" not in connection:
             damage.add(f"{self.path.name}: a connection without topic or type")
             return
         topic = Topic(
             name=fields["topic"].decode("utf-8", "replace"),
-            type_name=ros_type_name(told["type"].decode("utf-8", "replace")),
+            type_name=ros_type_name(connection["type"].decode("utf-8", "replace")),
             encoding="ros1",
-            definition=told.get("message_definition", b"").decode("utf-8", "replace"),
+            definition=connection.get("message_definition", b"").decode("utf-8", "replace"),
         )
         self.channels[number(fields, "conn")] = add_ros_type(topic)
 
@@ -165,10 +165,10 @@ class Bag1Log(RawLog):
 
     def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
         stream.seek(offset + 1)
-        kept = b""
+        tail = b""
         while block := stream.read(PIECE):
-            here = stream.tell()
-            base, block = here - len(block) - len(kept), kept + block
+            position = stream.tell()
+            base, block = position - len(block) - len(tail), tail + block
             at = block.find(_MARK)
             while at >= 0:
                 for back in _MARK_OFFSETS:
@@ -176,8 +176,8 @@ class Bag1Log(RawLog):
                     if place > offset and self._is_chunk(stream, place):
                         return place
                 at = block.find(_MARK, at + 1)
-            stream.seek(here)
-            kept = block[-(len(_MARK) - 1) :]
+            stream.seek(position)
+            tail = block[-(len(_MARK) - 1) :]
         return None
 
     def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
@@ -193,7 +193,7 @@ class Bag1Log(RawLog):
 
 def fields_of(header: bytes) -> dict[str, bytes] | None:
     """A header's named fields; None if invalid."""
-    found: dict[str, bytes] = {}
+    fields: dict[str, bytes] = {}
     at = 0
     while at < len(header):
         length = int.from_bytes(header[at : at + 4], "little")
@@ -201,8 +201,8 @@ def fields_of(header: bytes) -> dict[str, bytes] | None:
         name, equals, value = header[at - length : at].partition(b"=")
         if at > len(header) or not equals:
             return None
-        found[name.decode("latin-1")] = value
-    return found
+        fields[name.decode("latin-1")] = value
+    return fields
 
 
 def number(fields: Fields, name: str) -> int:
@@ -335,10 +335,10 @@ class Db3Log(RawLog):
 
 
 def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
-    found = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    refuse_if(not {"topics", "messages"} <= found, "no tables named topics and messages", error=ValueError)
+    tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    refuse_if(not {"topics", "messages"} <= tables, "no tables named topics and messages", error=ValueError)
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    rows = database.execute(query) if "message_definitions" in found else ()
+    rows = database.execute(query) if "message_definitions" in tables else ()
     definitions = {kind: (encoding, text) for kind, encoding, text in rows}
     topics: dict[object, Topic] = {}
     for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):

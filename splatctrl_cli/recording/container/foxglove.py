@@ -94,8 +94,8 @@ def find_ros_type(schema: str) -> str:
 def add_ros_type(topic: Topic) -> Topic:
     """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
     texts = _TEXTS if topic.type_name == TEXT else {}
-    said = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
-    ros_type = said or find_ros_type(topic.type_name)
+    schema = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
+    ros_type = schema or find_ros_type(topic.type_name)
     return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
 
 
@@ -171,19 +171,19 @@ def _transform(message: Any) -> Any:
 
 
 def _sdk_text(message: Any) -> Any:
-    said = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
+    entries = dict(part.split("=", 1) for part in message.data.split(";") if "=" in part)
     fields = ("fx", "fy", "ppx", "ppy", "coeffs", "rotation", "translation")
-    values = {key: np.array(said[key].split(","), np.float64) for key in fields if key in said}
-    if "fx" in said:
+    values = {key: np.array(entries[key].split(","), np.float64) for key in fields if key in entries}
+    if "fx" in entries:
         fx, fy, cx, cy = (float(values[key][0]) for key in ("fx", "fy", "ppx", "ppy"))
-        size = SimpleNamespace(width=float(said["width"]), height=float(said["height"]))
-        lens = {"distortion_model": said["model"], "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "D": values["coeffs"]}
+        size = SimpleNamespace(width=float(entries["width"]), height=float(entries["height"]))
+        lens = {"distortion_model": entries["model"], "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "D": values["coeffs"]}
         return _calibration(SimpleNamespace(**vars(size), **lens))
-    if "rotation" in said:
+    if "rotation" in entries:
         x, y, z, w = quat_from_rotation(values["rotation"].reshape(3, 3).T)  # written by columns
         t = dict(zip("xyz", values["translation"], strict=True))
         return SimpleNamespace(translation=SimpleNamespace(**t), rotation=SimpleNamespace(x=x, y=y, z=z, w=w))
-    return SimpleNamespace(data=float(said.get("Depth Units", 0) if said else message.data))
+    return SimpleNamespace(data=float(entries.get("Depth Units", 0) if entries else message.data))
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {

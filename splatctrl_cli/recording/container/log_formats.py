@@ -104,10 +104,10 @@ class SessionLog(JoinedLog):
     def _share(self, names: Collection[str]) -> bool:
         seen: set[str] = set()
         for part in self._parts:
-            here = {topic.name for topic in part.topics()}
-            if not here or seen & here & set(names):  # a log without index may hold anything
+            topic_names = {topic.name for topic in part.topics()}
+            if not topic_names or seen & topic_names & set(names):  # a log without index may hold anything
                 return True
-            seen |= here
+            seen |= topic_names
         return False
 
 
@@ -145,8 +145,8 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def _open_folder(path: Path) -> RawLog:
-    told, note = _metadata(path)
-    names = told.get("relative_file_paths")  # in recording order; else by numbers in names
+    metadata, note = _metadata(path)
+    names = metadata.get("relative_file_paths")  # in recording order; else by numbers in names
     files = [path / Path(name).name for name in dict.fromkeys(names or ())] or sorted(
         _storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)]
     )
@@ -157,7 +157,7 @@ def _open_folder(path: Path) -> RawLog:
         remedy="copy the whole bag",
     )
     refuse_if(not files, f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
-    mode, compression = str(told.get("compression_mode", "")).lower(), str(told.get("compression_format"))
+    mode, compression = str(metadata.get("compression_mode", "")).lower(), str(metadata.get("compression_format"))
     refuse_if(
         mode and compression != "zstd",
         f"{path}: compression {compression!r} is unknown, expected zstd",
@@ -205,15 +205,15 @@ def _metadata(path: Path) -> tuple[dict[str, Any], str]:
     if not file.is_file():
         return {}, ""
     try:
-        told = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
+        metadata = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
         refuse_if(
-            not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()),
+            not all(isinstance(name, str) for name in metadata.get("relative_file_paths") or ()),
             "a file's name is not text",
             error=ValueError,
         )
     except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):  # an undecodable text is a ValueError
         return {}, f"{file.name}: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
-    return told, ""
+    return metadata, ""
 
 
 _BAG = "and record its image, camera_info and tf topics with `ros2 bag record`"

@@ -32,10 +32,10 @@ HEAD = struct.Struct("<BQ")  # opcode and length of what follows
 class _Fields(ReadDataStream):  # type: ignore[misc]
     def read(self, length: int) -> bytes:
         """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
-        found: bytes = super().read(length)
-        if len(found) < length:
+        content: bytes = super().read(length)
+        if len(content) < length:
             raise EndOfFile
-        return found
+        return content
 
     def read_prefixed_string(self) -> str:
         return self.read(self.read4()).decode("utf-8", "replace")
@@ -110,21 +110,21 @@ class McapFile:
                 return []
             stream.seek(footer.summary_start)
             content = stream.read(min(self.size - footer.summary_start, 64 << 20))
-        found, at = [], 0
+        parts, at = [], 0
         while at + HEAD.size <= len(content):
             opcode, length = HEAD.unpack_from(content, at)
             start, at = at + HEAD.size, at + HEAD.size + length
             if opcode < FIRST_OPCODE or at > len(content) or opcode == FOOTER:
                 break
-            found.append(Part(footer.summary_start + start - HEAD.size, opcode, content[start:at]))
-        return found
+            parts.append(Part(footer.summary_start + start - HEAD.size, opcode, content[start:at]))
+        return parts
 
     def chunk_indexes(self) -> list[ChunkIndex]:
-        found: list[ChunkIndex] = []
+        indexes: list[ChunkIndex] = []
         for part in self.summary():
             with suppress(BadBlockError):
-                found += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
-        return sorted(found, key=lambda index: index.chunk_start_offset)
+                indexes += [parse_record(CHUNK_INDEX, part.content)] if part.opcode == CHUNK_INDEX else []
+        return sorted(indexes, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
         """A chunk record's content, or what a shorter file has of it."""
@@ -208,14 +208,14 @@ class _Walk:
             return self._places[position]
         before = _CHUNK_HEAD.size
         self._stream.seek(offset + 1)
-        kept = b""
+        tail = b""
         while block := self._stream.read(PIECE):
-            base = self._stream.tell() - len(block) - len(kept)
-            block = kept + block
-            found = min((at for at in self._chunks_in(block, base) if base + at > offset), default=None)
-            if found is not None:
-                return base + found
-            kept = block[-(before + 16) :]
+            base = self._stream.tell() - len(block) - len(tail)
+            block = tail + block
+            place = min((at for at in self._chunks_in(block, base) if base + at > offset), default=None)
+            if place is not None:
+                return base + place
+            tail = block[-(before + 16) :]
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
@@ -235,10 +235,10 @@ class _Walk:
     def _check_data(self, opcode: int, length: int) -> None:
         if opcode != DATA_END or length > PIECE:
             return
-        here, expected = self._stream.tell(), 0
+        position, expected = self._stream.tell(), 0
         with suppress(BadBlockError):
             expected = parse_record(DATA_END, self._stream.read(length)).data_section_crc
-        self._stream.seek(here)
+        self._stream.seek(position)
         if expected and self._crc is not None and self._crc != expected:
             self._add("checksum of the data section differs")
         self._crc = None

@@ -109,10 +109,15 @@ class McapLog(RawLog):
                 self._declare(part.opcode, part.content, Damage())
 
     def index(self) -> LogIndex:
-        found, chunks = self._statistics, tuple(self._file.chunk_indexes())
-        if found is None or len(chunks) != found.chunk_count:
+        statistics, chunks = self._statistics, tuple(self._file.chunk_indexes())
+        if statistics is None or len(chunks) != statistics.chunk_count:
             return index_by_heads(self._file)
-        return dict(found.channel_message_counts), (found.message_start_time, found.message_end_time), chunks, ()
+        return (
+            dict(statistics.channel_message_counts),
+            (statistics.message_start_time, statistics.message_end_time),
+            chunks,
+            (),
+        )
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; skips damage, reads a cut chunk to its cut.

@@ -72,7 +72,7 @@ def read_dtu(
         T_camera_world[:3, 3] /= MILLIMETRES
         return fit_intrinsics(K, size, path), invert_transform(T_camera_world)
 
-    found = read_views(
+    dtu_scan = read_views(
         scan,
         _images(folder),
         camera,
@@ -82,12 +82,12 @@ def read_dtu(
         keeps_without_depth=False,
     )
     refuse_if(
-        not found.views,
+        not dtu_scan.views,
         f"{root}: scan '{scan}' has no depth",
         remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on",
     )
-    check_lengths(f"{root}: scan '{scan}'", found.views)
-    return replace(found, files=(*found.files, *(_camera_file(root, number) for number in found.numbers)))
+    check_lengths(f"{root}: scan '{scan}'", dtu_scan.views)
+    return replace(dtu_scan, files=(*dtu_scan.files, *(_camera_file(root, number) for number in dtu_scan.numbers)))
 
 
 def choose_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
@@ -204,15 +204,15 @@ def scan_folders(root: Path) -> dict[str, Path]:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    found: dict[int, Path] = {}
+    images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
         if match:
             number = int(match[1]) - 1
-            if number not in found or match[2] == str(LIGHT):
-                found[number] = path
-    refuse_if(not found, f"{folder}: expected images such as rect_001_3_r5000.png, got none")
-    return dict(sorted(found.items()))
+            if number not in images or match[2] == str(LIGHT):
+                images[number] = path
+    refuse_if(not images, f"{folder}: expected images such as rect_001_3_r5000.png, got none")
+    return dict(sorted(images.items()))
 
 
 def read_image(path: Path) -> UInt8:
@@ -236,16 +236,16 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
 
 def _mask_file(folder: Path, number: int) -> Path:
     files = (path for place in (folder, folder / "mask") for path in sorted(place.glob("*.png")))
-    found = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
+    mask = next((path for path in files if path.stem.isdecimal() and int(path.stem) == number), None)
     return require(
-        found, f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
+        mask, f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
     )
 
 
 def _camera_file(root: Path, number: int) -> Path:
     candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
-    found = next(filter(Path.is_file, candidates), None)
-    return require(found, f"{candidates[-1]}: missing", remedy="every image needs its camera file")
+    file = next(filter(Path.is_file, candidates), None)
+    return require(file, f"{candidates[-1]}: missing", remedy="every image needs its camera file")
 
 
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:

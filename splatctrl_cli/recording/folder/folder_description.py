@@ -314,8 +314,8 @@ def check_camera(camera: CameraTable, where: str) -> None:
         remedy=_HELP,
     )
     names, model = ", ".join(DISTORTION_MODELS), camera.distortion_model
-    said = f"{where}.distortion_model: expected one of {names}, got {model!r}"
-    refuse_if(model not in DISTORTION_MODELS, said, remedy=_HELP)
+    what = f"{where}.distortion_model: expected one of {names}, got {model!r}"
+    refuse_if(model not in DISTORTION_MODELS, what, remedy=_HELP)
 
 
 def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T | None:

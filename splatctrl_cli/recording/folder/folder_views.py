@@ -78,7 +78,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     """
     listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
-    held = _holdout(description, names, options)
+    held_out = _holdout(description, names, options)
     views = []
     for position, view in enumerate(listed):
         lens = view.camera or description.camera
@@ -93,7 +93,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
                     human=view.human,
                     T_world_camera=T,
                     stamp_ns=_stamp_ns(description, view, position),
-                    camera=HOLDOUT if view.name in held else lens.name,
+                    camera=HOLDOUT if view.name in held_out else lens.name,
                     lens=lens,
                     depth_scale=_scale(description, view, options),
                     valid=view.valid,
@@ -114,7 +114,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
         )
         remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"
         raise InputError(f"{description.path}: {file} has no pose for any image ({names[0]}, ...)", remedy=remedy)
-    if held and all(view.camera == HOLDOUT for view in views):
+    if held_out and all(view.camera == HOLDOUT for view in views):
         remedy = "leave some to train with"
         refuse_if(
             options.holdout is not None,
@@ -159,14 +159,14 @@ def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
     if "*" not in pattern:
         return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
-    found = ((expression.fullmatch(path.relative_to(root).as_posix()), path) for path in sorted(root.glob(pattern)))
-    return [(match[1], path) for match, path in found if match is not None]
+    matches = ((expression.fullmatch(path.relative_to(root).as_posix()), path) for path in sorted(root.glob(pattern)))
+    return [(match[1], path) for match, path in matches if match is not None]
 
 
 def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options: SourceOptions) -> Float64 | None:
-    given = options.camera_poses.get(lens.name)
-    if given is not None:
-        return transform_from(given[:3], given[3:])
+    option = options.camera_poses.get(lens.name)
+    if option is not None:
+        return transform_from(option[:3], option[3:])
     if view.matrix is None or not np.isfinite(view.matrix).all():  # so trackers write that they were lost
         return None
     assert table is not None
@@ -190,9 +190,9 @@ def _listed(description: Description, options: SourceOptions, loss: LossReport) 
     assert frames is not None and camera is not None
     colors = dict(find_files(description.root, frames.color))
     depths = dict(find_files(description.root, frames.depth))
-    for pattern, found in ((frames.color, colors), (frames.depth, depths)):
+    for pattern, files in ((frames.color, colors), (frames.depth, depths)):
         refuse_if(
-            not found,
+            not files,
             f"{description.path}: no file matches {description.root / pattern}",
             remedy="correct [frames] or root",
         )
@@ -256,18 +256,18 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
 
 def _holdout(description: Description, names: list[str], options: SourceOptions) -> set[str]:
     entries = description.split.holdout if options.holdout is None else options.holdout
-    held = set()
+    held_out = set()
     for entry in entries:
         if str(entry) in names:
-            held.add(str(entry))
+            held_out.add(str(entry))
         elif str(entry).isdigit() and int(entry) < len(names):
-            held.add(names[int(entry)])
+            held_out.add(names[int(entry)])
         else:
             raise InputError(
                 f"{description.path}: holdout {entry!r}: no such frame",
                 remedy=f"use a name ({names[0]} to {names[-1]}) or a position (0 to {len(names) - 1})",
             )
-    return held
+    return held_out
 
 
 def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
@@ -275,8 +275,8 @@ def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
     if view.stamp_ns is not None:
         return view.stamp_ns
     if stamps.names:
-        said = f"{description.path}: stamps.names: expected seconds, got {view.name!r}"
-        return require(stamp_of_text(view.name), said, remedy="see splatctrl help input")
+        what = f"{description.path}: stamps.names: expected seconds, got {view.name!r}"
+        return require(stamp_of_text(view.name), what, remedy="see splatctrl help input")
     return round(_number(view.name) * SECOND_NS / stamps.rate) if stamps.rate is not None else position * SECOND_NS
 
 

@@ -67,15 +67,15 @@ def read_idr(
         file = (depths or folder / "depth") / f"depth_map_{number:04d}.pfm"
         return file if file.is_file() else None
 
-    found = read_views(
+    dtu_scan = read_views(
         scan, images, camera, depth_of=depth_of, mask_of=masks.get, shrink=shrink, keeps_without_depth=True
     )
     refuse_if(
-        depths is not None and len(found.without_depth) == len(found.views),
+        depths is not None and len(dtu_scan.without_depth) == len(dtu_scan.views),
         f"{depths}: expected depth_map_0000.pfm and so on, got none",
     )
-    check_lengths(f"{folder}", found.views)
-    return replace(found, files=(*found.files, path))
+    check_lengths(f"{folder}", dtu_scan.views)
+    return replace(dtu_scan, files=(*dtu_scan.files, path))
 
 
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
@@ -144,17 +144,17 @@ def _number_images(folder: Path, num: int) -> dict[int, Path]:
     paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
     if len(paths) == num:
         return dict(enumerate(paths))
-    found: dict[int, Path] = {}
+    numbered: dict[int, Path] = {}
     for path in paths:
         number = int(path.stem) if path.stem.isdecimal() else num
         refuse_if(
-            number >= num or number in found,
+            number >= num or number in numbered,
             f"{path}: expected one picture for each of {num} cameras, or their numbers as names, got {len(paths)}"
-            f" and this one" + (f" beside {found[number].name}" if number in found else ""),
+            f" and this one" + (f" beside {numbered[number].name}" if number in numbered else ""),
             remedy=f"name it by its camera's number, as {0:06d}.png to {num - 1:06d}.png, or take it away",
         )
-        found[number] = path
-    return dict(sorted(found.items()))
+        numbered[number] = path
+    return dict(sorted(numbered.items()))
 
 
 def _projections(path: Path) -> list[Float64]:
@@ -228,15 +228,15 @@ class DtuSource:
     ) -> None:
         self.layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
         self._root = root
-        found = self._read(
+        dtu_scan = self._read(
             scan,
             masks,
             depths,
             lambda view: shrink_view(view, _factor(view, protocol) if downscale is None else downscale),
         )
-        self.scan, self.name = found.name, f"{root.name}/{found.name}"
-        self._files = found.files
-        self._views = dict(zip(found.numbers, found.views, strict=True))
+        self.scan, self.name = dtu_scan.name, f"{root.name}/{dtu_scan.name}"
+        self._files = dtu_scan.files
+        self._views = dict(zip(dtu_scan.numbers, dtu_scan.views, strict=True))
         numbers = tuple(self._views)
         if protocol is not None:
             refuse_if(
@@ -245,13 +245,13 @@ class DtuSource:
                 remedy="leave one of them out",
                 error=UsageError,
             )
-            self.split = protocol.split(numbers, f"{root}/{found.name}")
+            self.split = protocol.split(numbers, f"{root}/{dtu_scan.name}")
         else:
             self.split = _held_out(numbers, frozenset(holdout), root)
         self._held = set(self.split.scored) - set(self.split.training)
         self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
         is_left_out = self.layout == "MVSNet"
-        notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in found.without_depth]
+        notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in dtu_scan.without_depth]
         self.loss = LossReport(unpaired_color=len(notes), notes=notes)
 
     def _read(self, scan: str | None, masks: Path | None, depths: Path | None, shrink: Shrink) -> DtuScan:

@@ -138,7 +138,7 @@ class ImageFolderSource(FrameSource):
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        found: dict[str, Path] = {}
+        by_name: dict[str, Path] = {}
         for description in self._descriptions:
             lens = None if len(self._descriptions) == 1 else description.camera
             views = [view for view in self._views if lens is None or view.lens == lens]
@@ -147,11 +147,11 @@ class ImageFolderSource(FrameSource):
             if description.poses is not None:
                 files.extend(path for _, path in find_files(description.root, description.poses.file))
             named = {str(path.relative_to(description.root)): path.absolute() for path in files}
-            found |= {
+            by_name |= {
                 **({description.path.name: description.path} if description.path.is_file() else {}),
                 **dict(sorted(named.items())),
             }
-        return {name: sha256(path) for name, path in found.items()}
+        return {name: sha256(path) for name, path in by_name.items()}
 
     def _stored_frame(self, view: View) -> StoredFrame | None:
         color_bytes = view.color.read_bytes()
@@ -346,9 +346,9 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 def unknown_folder(folder: Path, what: str, remedy: str) -> InputError:
     """An error that names readable parts, else missing depth."""
     inside = _readable_in(folder)
-    if not inside and (found := _bare_images(folder)):
+    if not inside and (bare := _bare_images(folder)):
         return InputError(
-            f"{folder}: {found}",
+            f"{folder}: {bare}",
             remedy="describe colour, depth, lens and poses in a .toml (splatctrl help input); info, score and"
             " reconstruct --points CLOUD.ply work without depth, but not without poses: a transforms.json"
             " (ns-process-data writes it)",
@@ -363,17 +363,17 @@ def _bare_images(folder: Path) -> str:
 
 
 def _readable_in(folder: Path) -> str:
-    found = []
+    parts = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name
         if path.is_file() and (path.suffix in SUFFIXES or layout_of(path) is not None):
-            found.append(path.name)
+            parts.append(path.name)
         elif path.is_dir() and (layout := layout_of(path)) is not None:
-            found.append(f"{path.name} ({layout.name})")
+            parts.append(f"{path.name} ({layout.name})")
         elif path.is_dir() and (path / "metadata.yaml").is_file():
-            found.append(f"{path.name} (ROS 2 bag)")
+            parts.append(f"{path.name} (ROS 2 bag)")
         elif path.is_dir() and (path / "capture.json").is_file():
-            found.append(f"{path.name} (capture)")
-    return ", ".join(found[:_MOST_NAMED]) + (
-        f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+            parts.append(f"{path.name} (capture)")
+    return ", ".join(parts[:_MOST_NAMED]) + (
+        f" and {len(parts) - _MOST_NAMED} more" if len(parts) > _MOST_NAMED else ""
     )

@@ -131,11 +131,11 @@ def describe(
     """
     first = pairs.listed[0]
     camera = first.camera if lens is None else lens_option(options, first.color) or lens(first.color)
-    found = replace(pairs, root=root, camera=camera, stamps=StampsTable(names=has_stamps), **fields)
-    for table in (camera, found.depth_camera):
+    description = replace(pairs, root=root, camera=camera, stamps=StampsTable(names=has_stamps), **fields)
+    for table in (camera, description.depth_camera):
         if table is not None:
-            check_camera(table, str(found.path))
-    return found
+            check_camera(table, str(description.path))
+    return description
 
 
 def lens_option(options: SourceOptions, image: ImageFile) -> CameraTable | None:

@@ -138,8 +138,8 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
     for sensor in _sensors(folder):
         path = folder / f"{Path(FILE).stem}{sensor}.json"
         color_folder = next((f for name in COLOR_FOLDERS if (f := folder / f"{name}{sensor}").is_dir()), None)
-        said = f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none"
-        colors = images_of(require(color_folder, said, remedy="unpack the whole scene"))
+        what = f"{folder}: expected a folder rgb{sensor} or gray{sensor}, got none"
+        colors = images_of(require(color_folder, what, remedy="unpack the whole scene"))
         depths = images_of(folder / f"depth{sensor}")
         views += _views(path, sensor, colors, depths)
         files.append(path)
@@ -155,8 +155,8 @@ def read_bop(folder: Path, options: SourceOptions) -> Description:
 
 def _sensors(folder: Path) -> list[str]:
     stem = Path(FILE).stem
-    found = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
-    return [sensor for sensor in found if (folder / f"depth{sensor}").is_dir()]
+    sensors = sorted(path.stem.removeprefix(stem) for path in folder.glob(f"{stem}*.json"))
+    return [sensor for sensor in sensors if (folder / f"depth{sensor}").is_dir()]
 
 
 def _views(path: Path, sensor: str, colors: dict[str, Path], depths: dict[str, Path]) -> list[ListedView]:
@@ -252,8 +252,10 @@ def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
 
 def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and "depth" not in path.name.lower()]
-    found = [{stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)]
-    most = max(found, key=len)
+    by_folder = [
+        {stem: path for stem, path in images_of(place).items() if stem in stems} for place in (*inner, folder)
+    ]
+    most = max(by_folder, key=len)
     refuse_if(
         not most,
         f"{folder}: no image is named like a camera file ({min(stems)}_cam.txt)",
@@ -263,14 +265,14 @@ def _images(folder: Path, stems: set[str]) -> dict[str, Path]:
 
 
 def _depths(folder: Path) -> tuple[dict[int, Path], list[str]]:
-    found = {
+    by_folder = {
         path.name: dict(_maps(path)) for path in folder.iterdir() if path.is_dir() and "depth" in path.name.lower()
     }
-    names = sorted((any(word in name for word in _ESTIMATED), name) for name, maps in found.items() if maps)
+    names = sorted((any(word in name for word in _ESTIMATED), name) for name, maps in by_folder.items() if maps)
     if not names:
         return {}, []
     first, *others = (name for _, name in names)
-    return found[first], [f"depth is that of {first}/, not of {', '.join(others)}"] if others else []
+    return by_folder[first], [f"depth is that of {first}/, not of {', '.join(others)}"] if others else []
 
 
 def _maps(folder: Path) -> Iterator[tuple[int, Path]]:

@@ -85,10 +85,10 @@ def _view(
     description: Description,
     matrices: dict[str, Float64],
 ) -> ListedView:
-    name, said = str(entry["file_path"]), {**content, **entry}
+    name, values = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / name.replace("\\", "/"))
     depth = _only(entry, ("depth_file_path", "depth_path"), path)
-    scale = _only(said, ("depth_unit_scale_factor", "integer_depth_scale"), path)
+    scale = _only(values, ("depth_unit_scale_factor", "integer_depth_scale"), path)
     mask = entry.get("mask_path")
     with refuse_faults(
         lambda error: f"{path}: {name}: expected numbers, got {error}",
@@ -106,17 +106,17 @@ def _view(
         color=color,
         depth=None if depth is None else path.parent / str(depth).replace("\\", "/"),
         matrix=matrix,
-        camera=description.camera or add_lens(lenses, _camera(said, color, path), str(path)),
+        camera=description.camera or add_lens(lenses, _camera(values, color, path), str(path)),
         depth_scale=unit,
         valid=None if not mask else path.parent / str(mask).replace("\\", "/"),
     )
 
 
-def _only(said: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
-    found = {key: said[key] for key in keys if said.get(key) not in (None, "")}
-    both = " and ".join(f"{key} = {value}" for key, value in found.items())
-    refuse_if(len(set(found.values())) > 1, f"{path}: {both} differ", remedy="leave one of them out")
-    return next(iter(found.values()), None)
+def _only(values: dict[str, Any], keys: tuple[str, ...], path: Path) -> Any:
+    present = {key: values[key] for key in keys if values.get(key) not in (None, "")}
+    both = " and ".join(f"{key} = {value}" for key, value in present.items())
+    refuse_if(len(set(present.values())) > 1, f"{path}: {both} differ", remedy="leave one of them out")
+    return next(iter(present.values()), None)
 
 
 def _image(path: Path) -> Path:
@@ -125,16 +125,16 @@ def _image(path: Path) -> Path:
     return next((file for end in ends if (file := path.with_name(path.name + end)).is_file()), path)
 
 
-def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
-    model = str(said.get("camera_model") or ("OPENCV_FISHEYE" if said.get("is_fisheye") else "OPENCV"))
+def _camera(values: dict[str, Any], image: Path, path: Path) -> CameraTable:
+    model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
     refuse_if(
         model not in _MODELS,
         f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
         remedy="undistort the images",
     )
     refuse_if(
-        "is_fisheye" in said and bool(said["is_fisheye"]) != (model == "OPENCV_FISHEYE"),
-        f"{path}: camera_model is {model}, but is_fisheye is {said.get('is_fisheye')}",
+        "is_fisheye" in values and bool(values["is_fisheye"]) != (model == "OPENCV_FISHEYE"),
+        f"{path}: camera_model is {model}, but is_fisheye is {values.get('is_fisheye')}",
         remedy="correct one of them",
     )
     with refuse_faults(
@@ -145,22 +145,22 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
         ZeroDivisionError,
         remedy="give [camera] and [frames] in a description",
     ):
-        distortion = [float(said.get(key, 0.0)) for key in _COEFFICIENTS[model]]
-        further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(said.get(key, 0.0)))
+        distortion = [float(values.get(key, 0.0)) for key in _COEFFICIENTS[model]]
+        further = sorted(key for key in _ALL if key not in _COEFFICIENTS[model] and float(values.get(key, 0.0)))
         if further:
             raise InputError(
-                f"{path}: camera_model {model}: expected no {further[0]}, got {said[further[0]]}",
+                f"{path}: camera_model {model}: expected no {further[0]}, got {values[further[0]]}",
                 remedy="correct the model, or undistort the images",
             )
-        width, height = (int(said["w"]), int(said["h"])) if {"w", "h"} <= said.keys() else image_size(image)
-        fx = float(said["fl_x"]) if "fl_x" in said else width / 2 / math.tan(float(said["camera_angle_x"]) / 2)
+        width, height = (int(values["w"]), int(values["h"])) if {"w", "h"} <= values.keys() else image_size(image)
+        fx = float(values["fl_x"]) if "fl_x" in values else width / 2 / math.tan(float(values["camera_angle_x"]) / 2)
         return CameraTable(
             width=width,
             height=height,
             fx=fx,
-            fy=float(said.get("fl_y", fx)),
-            cx=float(said.get("cx", width / 2)),
-            cy=float(said.get("cy", height / 2)),
+            fy=float(values.get("fl_y", fx)),
+            cx=float(values.get("cx", width / 2)),
+            cy=float(values.get("cy", height / 2)),
             pixel_center=0.5,  # nerfstudio's convention
             distortion=distortion,
             distortion_model=_MODELS[model],

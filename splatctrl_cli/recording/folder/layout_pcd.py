@@ -49,14 +49,14 @@ def read_cloud(path: Path) -> tuple[Float64, UInt8, Float64]:
 
     Raises InputError for another.
     """
-    said = _head(path)
-    size = (said.height, said.width)
+    head = _head(path)
+    size = (head.height, head.width)
     with _refuse_damage(path):
         columns = _library().PointCloud.from_path(path).pc_data
         points = np.stack([columns[axis].astype(np.float64).reshape(size) for axis in "xyz"], axis=-1)
-        packed = columns["rgb" if "rgb" in said.fields else "rgba"].view(np.uint32).reshape(size)
+        packed = columns["rgb" if "rgb" in head.fields else "rgba"].view(np.uint32).reshape(size)
     color = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
-    return points, color, _viewpoint(said)
+    return points, color, _viewpoint(head)
 
 
 def pinhole_of(points: Float64) -> Intrinsics | None:
@@ -129,26 +129,26 @@ def read(path: Path, options: SourceOptions) -> Description:
 
 
 def _fit_lens(path: Path, options: SourceOptions) -> tuple[Intrinsics, bool, list[str]]:
-    (written, _, T), given = read_cloud(path), options.intrinsics.get(CAMERA)
+    (written, _, T), option = read_cloud(path), options.intrinsics.get(CAMERA)
     fits, (height, width) = [], written.shape[:2]
     for is_world in (False, True):
         points = transform_points(invert_transform(T), written) if is_world else written
         camera = pinhole_of(points)
-        if given is not None:
+        if option is not None:
             refuse_if(
-                len(given) > 4,
+                len(option) > 4,
                 f"--intrinsics: expected FX,FY,CX,CY for {path.name}, got distortion coefficients",
                 error=UsageError,
             )
-            fx, fy, cx, cy = given
+            fx, fy, cx, cy = option
             camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
         fits.append((residual(points, camera), is_world, camera))
     far, is_world, camera = min(fits, key=lambda fit: fit[0])
     if camera is None or far > CLOUD_RESIDUAL:
-        raise _unfit(path, far, "of a pinhole camera" if given is None else "that of --intrinsics")
+        raise _unfit(path, far, "of a pinhole camera" if option is None else "that of --intrinsics")
     k = f"fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f} px"
     note = f"intrinsics are those of the grid of {path.name}: {k}, within {far:.2g} px"
-    return camera, is_world, [] if given is not None else [note]
+    return camera, is_world, [] if option is not None else [note]
 
 
 def _unfit(path: Path, far: float, what: str) -> InputError:
@@ -168,40 +168,40 @@ def _head(path: Path) -> Any:
                 lines += [line] if line and not line.startswith("#") else []
                 if line.startswith("DATA"):
                     break
-        said = _library().MetaData.parse_header(lines)
+        head = _library().MetaData.parse_header(lines)
     refuse_if(
-        said.height <= 1,
-        f"{path}: not organised: {said.width} points in one row",
+        head.height <= 1,
+        f"{path}: not organised: {head.width} points in one row",
         remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
     )
     refuse_if(
-        not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height,
-        f"{path}: {said.points} points of {said.width}x{said.height}",
+        not 0 < head.width * head.height <= MOST_PIXELS or head.points != head.width * head.height,
+        f"{path}: {head.points} points of {head.width}x{head.height}",
         remedy=_AGAIN,
     )
     refuse_if(
-        not np.linalg.norm(said.viewpoint[3:]) > 0.5,
-        f"{path}: VIEWPOINT: expected a quaternion, got {said.viewpoint[3:]}",
+        not np.linalg.norm(head.viewpoint[3:]) > 0.5,
+        f"{path}: VIEWPOINT: expected a quaternion, got {head.viewpoint[3:]}",
         remedy=_AGAIN,
     )
     refuse_if(
-        not {"rgb", "rgba"} & set(said.fields),
-        f"{path}: no colour: expected a field rgb or rgba, got {' '.join(said.fields)}",
+        not {"rgb", "rgba"} & set(head.fields),
+        f"{path}: no colour: expected a field rgb or rgba, got {' '.join(head.fields)}",
         remedy="save clouds with colour (PCL: PointXYZRGB, PointXYZRGBL)",
     )
-    return said
+    return head
 
 
 def _refuse_damage(path: Path) -> AbstractContextManager[None]:
     def text(error: Exception) -> str:
-        said = " ".join(str(error).split())[:200] or type(error).__name__
-        return f"{path}: not a PCD that can be read: {said}"
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        return f"{path}: not a PCD that can be read: {reason}"
 
     return refuse_faults(text, *_DAMAGE, remedy=_AGAIN)
 
 
-def _viewpoint(said: Any) -> Float64:
-    x, y, z, qw, qx, qy, qz = said.viewpoint
+def _viewpoint(head: Any) -> Float64:
+    x, y, z, qw, qx, qy, qz = head.viewpoint
     return transform_from((x, y, z), (qx, qy, qz, qw))
 
 

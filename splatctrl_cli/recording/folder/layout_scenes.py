@@ -160,8 +160,8 @@ def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
 
 
 def _number(name: str) -> int:
-    found = re.search(r"\d+", name)
-    return int(found[0]) if found else -1
+    match = re.search(r"\d+", name)
+    return int(match[0]) if match else -1
 
 
 def _redwood_lens(folder: Path) -> CameraTable:

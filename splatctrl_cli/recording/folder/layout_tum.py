@@ -98,15 +98,15 @@ def read_tum_folder(folder: Path, options: SourceOptions) -> Description:
 
 def list_files(path: Path) -> list[tuple[int, Path]]:
     """Stamp [ns] and file of lines ``stamp path``."""
-    found = []
+    files = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.split()
         if words and not line.startswith("#"):
             stamp_ns = stamp_of_text(words[0])
             if stamp_ns is None or len(words) != 2:
                 raise InputError(f"{path}:{number}: expected 'stamp file', got {line!r}", remedy="correct the line")
-            found.append((stamp_ns, path.parent / words[1].replace("\\", "/")))
-    return found
+            files.append((stamp_ns, path.parent / words[1].replace("\\", "/")))
+    return files
 
 
 def _series(folder: Path) -> str:
@@ -161,8 +161,8 @@ def read_sun3d(folder: Path, options: SourceOptions) -> Description:
 
 
 def _list_by_stamp(folder: Path) -> list[tuple[int, Path]]:
-    found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
-    return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
+    stamped = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
+    return [(stamp_ns, path) for stamp_ns, path in stamped if stamp_ns is not None]
 
 
 def _poses(path: Path) -> list[Float64]:

@@ -71,14 +71,12 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
         if prefixes:
             groups.setdefault((device,) if device else max(prefixes, key=len), []).append(depth)
     cameras: list[CameraTopics] = []
-    taken: set[str] = set()
+    used: set[str] = set()
     for namespace in sorted(groups, key=lambda parts: (-len(parts), parts)):
-        free = [
-            c for c in colors if c.topic.name not in taken and _parts(c.topic.name)[: len(namespace)] == namespace
-        ]
+        free = [c for c in colors if c.topic.name not in used and _parts(c.topic.name)[: len(namespace)] == namespace]
         if not free:
             continue
-        taken.update(c.topic.name for c in free)
+        used.update(c.topic.name for c in free)
         color = min(free, key=_color_rank)
         cameras.append(_camera(survey, namespace, color, groups[namespace]))
     return _name_cameras(cameras)
@@ -124,7 +122,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
     folder, its = _parts(image.topic.name)[:-1], image.first_image
     view = ("", 0, 0) if its is None else (its.frame_id, its.width, its.height)
     level = len(folder) - 1 if namespace is None else len(namespace)
-    found: list[tuple[int, int, str]] = []
+    candidates: list[tuple[int, int, str]] = []
     for info in survey.select_types(CAMERA_INFO):
         calibration = info.calibration
         if calibration is None:
@@ -133,8 +131,8 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
         shared = len(common_prefix(info.topic.name, image.topic.name))
         is_near = shared > level or info_folder in {folder, folder[:level]}
         if is_near or (view == (calibration.frame_id, calibration.width, calibration.height) and view[0] != ""):
-            found.append((-shared, len(info_folder), info.topic.name))
-    return min(found)[2] if found else ""
+            candidates.append((-shared, len(info_folder), info.topic.name))
+    return min(candidates)[2] if candidates else ""
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
@@ -273,15 +271,15 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
 
 
 def _named_unlike(survey: Survey) -> str:
-    found = []
+    texts = []
     for topic in image_topics(survey, "unlike"):
         image, name = topic.image, topic.topic.name
         is_jpeg = image.compressed is not None and image.compressed.startswith(JPEG)
         lossy = (
             "depth in a JPEG: JPEG loses depth: record PNG" if is_jpeg else f"{image.encoding} that is named depth"
         )
-        found.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
-    return f"; neither depth nor colour: {listed(found)}" if found else ""
+        texts.append(f"{name} ({f'named {_unlike(topic)}' if image.kind == 'depth' else lossy})")
+    return f"; neither depth nor colour: {listed(texts)}" if texts else ""
 
 
 def listed(names: Sequence[str]) -> str:
@@ -318,9 +316,12 @@ def join_pose_topics(
     place its camera, or several odometries could.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
-    asked = {name: given for name, given in options.camera_pose_topics.items() if name in frames}
+    by_camera = {name: pose_topic for name, pose_topic in options.camera_pose_topics.items() if name in frames}
     for topic, child in (
-        {given[0]: _child_of(log, survey, name, given, frames[name]) for name, given in asked.items()}
+        {
+            pose_topic[0]: _child_of(log, survey, name, pose_topic, frames[name])
+            for name, pose_topic in by_camera.items()
+        }
         or _odometries(log, survey, options, set(frames.values()))
     ).items():
         _add(log, survey, topic, child, only_first=only_first)
@@ -330,8 +331,8 @@ def pose_topics(survey: Survey) -> list[str]:
     return [topic.topic.name for topic in survey.select_types(*POSE_TYPES)]
 
 
-def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], frame: str) -> str:
-    topic, posed = given
+def _child_of(log: RawLog, survey: Survey, camera: str, pose_topic: tuple[str, str], frame: str) -> str:
+    topic, posed = pose_topic
     where = f"{log.path}: --camera-pose {camera}={topic}"
     refuse_if(
         topic not in pose_topics(survey),
@@ -357,7 +358,7 @@ def _child_of(log: RawLog, survey: Survey, camera: str, given: tuple[str, str], 
 
 def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set[str]) -> dict[str, str]:
     known = set(survey.tf.frames)
-    found: dict[str, str] = {}
+    odometries: dict[str, str] = {}
     for topic in survey.select_types(ODOMETRY):
         parent, child, *_ = next(_poses(log, survey, topic.topic.name, Damage()), ("", ""))
         if not child or child == parent or survey.tf.root_of(child) != child:
@@ -365,21 +366,21 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
         places_camera = child in frames - known
         reaches_world = options.world_frame not in known and options.world_frame == parent
         if places_camera or (reaches_world and child in known | frames):
-            found[topic.topic.name] = child
+            odometries[topic.topic.name] = child
         elif child in known and any(survey.tf.root_of(frame) == child for frame in frames & known):
             survey.tf.note(
                 f"{topic.topic.name} says where {child!r} is in {parent!r}; to use it give --world-frame {parent}"
             )
-    for child in sorted(set(found.values())):
-        topics = sorted(name for name, posed in found.items() if posed == child)
+    for child in sorted(set(odometries.values())):
+        topics = sorted(name for name, posed in odometries.items() if posed == child)
         refuse_if(
             len(topics) > 1,
             f"{log.path}: {len(topics)} odometries place frame {child!r}: {', '.join(topics)}",
             remedy=f"choose one with --camera-pose NAME={topics[0]}",
         )
-    for name, child in found.items():
+    for name, child in odometries.items():
         survey.tf.note(f"poses of frame {child!r} are those of {name}: tf does not say where it is")
-    return found
+    return odometries
 
 
 def _add(log: RawLog, survey: Survey, topic: str, child: str, *, only_first: bool) -> None:

@@ -177,10 +177,10 @@ def _names(description: Any) -> list[str]:
 def _check_fields(store: Any) -> None:
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
-        there = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
+        fields = {key.lower(): _kind(description) for key, description in store.fielddefs[name][1]}
         for key, description in standard[name][1]:
             refuse_if(
-                there.get(key) != _kind(description),
+                fields.get(key) != _kind(description),
                 f"{name} lacks the field {key} of the standard",
                 error=ValueError,
             )
@@ -251,13 +251,13 @@ class RealSense:
 
     def depth_unit(self, topic: str) -> float | None:
         """Metres per count, None if unknown. Raises InputError if it changes."""
-        said = self.image_units.get(_stream(topic), [])
-        if len(said) > 1:
+        units = self.image_units.get(_stream(topic), [])
+        if len(units) > 1:
             raise InputError(
-                f"topic {topic}: the depth unit changes, from {said[0]:g} to {said[1]:g} m",
+                f"topic {topic}: the depth unit changes, from {units[0]:g} to {units[1]:g} m",
                 remedy="cut the bag there, or give --depth-scale [m per count] for all of it",
             )
-        return said[0] if said else self.depth_units.get(_stream(topic).rpartition("/")[0])
+        return units[0] if units else self.depth_units.get(_stream(topic).rpartition("/")[0])
 
 
 def has_unit(message: RawMessage) -> bool:

@@ -125,8 +125,8 @@ def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMe
         pixels = raw_pixels(message)
         return _image(message, message.encoding, pixels.shape, lambda: pixels, None)
     packed = _packed(message.format, bytes(message.data))
-    if lazily and (found := _plain(packed)) is not None:
-        encoding, size, color = found
+    if lazily and (plain := _plain(packed)) is not None:
+        encoding, size, color = plain
         return _image(message, encoding, size, partial(_decode, packed, color=color), packed.file)
     pixels, encoding, compressed = _compressed_depth(packed) if packed.is_depth else _compressed_pixels(packed)
     return _image(message, encoding, pixels.shape, lambda: pixels, compressed, packed.remark)
@@ -459,7 +459,7 @@ def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
     for part in reversed(parts):
         words = re.findall("[a-z]+", part.lower())
         words = words[: words.index("to")] if "to" in words[1:] else words
-        found = [word for word in words if word in _WORDS or word.removesuffix("map") == DEPTH]
-        if found and (is_device or _CAMERAS.isdisjoint(words)):
-            return DEPTH if found[-1].startswith(DEPTH) else found[-1]
+        matches = [word for word in words if word in _WORDS or word.removesuffix("map") == DEPTH]
+        if matches and (is_device or _CAMERAS.isdisjoint(words)):
+            return DEPTH if matches[-1].startswith(DEPTH) else matches[-1]
     return ""

@@ -67,10 +67,10 @@ class Camera(Lens):
 
 def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[Camera, ...]:
     """Build requested cameras. Raises InputError naming camera, topic and problem."""
-    found = camera_topics(log, survey, options)
-    if not found:
+    topics = camera_topics(log, survey, options)
+    if not topics:
         raise no_camera(log, survey)
-    known = {camera.name: camera for camera in found}
+    known = {camera.name: camera for camera in topics}
     names = tuple(known) if options.cameras is None else options.cameras
     refuse_unknown_cameras(
         log.path, (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics), known
@@ -100,18 +100,18 @@ def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
     """List what a reconstruction would miss."""
-    found = camera_topics(log, survey, options)
-    if not found:
+    camera_list = camera_topics(log, survey, options)
+    if not camera_list:
         lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
         if not survey.select_types(CAMERA_INFO):
             lacks.append("no CameraInfo topic; record the colour camera's camera_info")
         return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
     lacks = []
     try:
-        join_pose_topics(log, survey, options, found, only_first=True)
+        join_pose_topics(log, survey, options, camera_list, only_first=True)
     except InputError as error:
         lacks.append(str(error).removeprefix(f"{log.path}: "))
-    for topics in found:
+    for topics in camera_list:
         if options.cameras is not None and topics.name not in options.cameras:
             continue
         lacks.extend(_Builder(log, survey, options, topics).problems())
@@ -214,7 +214,7 @@ class _Builder:
         )
 
     def problems(self) -> list[str]:
-        found = []
+        problems = []
         any_lens = Lens(intrinsics=Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1))
         steps: list[Callable[[], object]] = [
             self._check_depth,
@@ -228,8 +228,8 @@ class _Builder:
             try:
                 step()
             except InputError as error:
-                found.append(str(error).removeprefix(f"{self._path}: "))
-        return list(dict.fromkeys(found))
+                problems.append(str(error).removeprefix(f"{self._path}: "))
+        return list(dict.fromkeys(problems))
 
     @property
     def _depth_scale(self) -> float | None:
@@ -242,14 +242,14 @@ class _Builder:
 
     def _calibration(self, info: str, image_topic: str) -> Calibration:
         calibration = self._survey.topics[info].calibration if info else None
-        given = self._options.intrinsics.get(self._topics.name)
-        if given is not None and image_topic == self._topics.color:
-            return self._read_intrinsics(given, image_topic)
-        there = [t.topic.name for t in self._survey.select_types(CAMERA_INFO)]
+        option = self._options.intrinsics.get(self._topics.name)
+        if option is not None and image_topic == self._topics.color:
+            return self._read_intrinsics(option, image_topic)
+        infos = [t.topic.name for t in self._survey.select_types(CAMERA_INFO)]
         calibration = require(
             calibration,
             f"{self._where}: topic {image_topic} has no usable CameraInfo",
-            remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
+            remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(infos)};"
             f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
         )
         image = self._survey.topics[image_topic].image
@@ -395,27 +395,27 @@ class _Builder:
 
 def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
     cameras = []
-    for given in options.camera_topics:
-        for topic, kind in ((given.color, "colour"), (given.depth, "depth")):
+    for camera in options.camera_topics:
+        for topic, kind in ((camera.color, "colour"), (camera.depth, "depth")):
             images = [t.topic.name for t in survey.select_types(IMAGE, COMPRESSED_IMAGE) if t.first_image is not None]
             refuse_if(
                 topic not in images,
-                f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
+                f"{log.path}: --camera {camera.name}: no {kind} images on topic {topic}",
                 remedy=f"image topics there: {listed(images)}",
             )
         refuse_if(
-            given.info and given.info not in [t.topic.name for t in survey.select_types(CAMERA_INFO)],
-            f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
+            camera.info and camera.info not in [t.topic.name for t in survey.select_types(CAMERA_INFO)],
+            f"{log.path}: --camera {camera.name}: no CameraInfo on topic {camera.info}",
             remedy="leave INFO out to have it found",
         )
-        color, depth = survey.topics[given.color], survey.topics[given.depth]
+        color, depth = survey.topics[camera.color], survey.topics[camera.depth]
         cameras.append(
             CameraTopics(
-                name=given.name,
-                color=given.color,
-                depth=given.depth,
-                info=given.info or find_info(survey, color),
-                depth_info=given.depth_info or find_info(survey, depth),
+                name=camera.name,
+                color=camera.color,
+                depth=camera.depth,
+                info=camera.info or find_info(survey, color),
+                depth_info=camera.depth_info or find_info(survey, depth),
             )
         )
     return tuple(cameras)

@@ -115,13 +115,15 @@ class FramePlan:
 
     def uses(self) -> dict[str, Index]:
         """Number of frames that need each image."""
-        found: dict[str, list[Index]] = {}
+        by_topic: dict[str, list[Index]] = {}
         for number, camera in enumerate(self._cameras):
             of_camera = self._columns[:, self._columns[1] == number]
             for topic, row in ((camera.color_topic, 2), (camera.depth_topic, 3), (camera.human_topic, 4)):
-                found.setdefault(topic, []).append(of_camera[row][of_camera[row] != NO_MASK])
+                by_topic.setdefault(topic, []).append(of_camera[row][of_camera[row] != NO_MASK])
         return {
-            topic: np.bincount(np.concatenate(indices)) for topic, indices in found.items() if any(map(len, indices))
+            topic: np.bincount(np.concatenate(indices))
+            for topic, indices in by_topic.items()
+            if any(map(len, indices))
         }
 
 
@@ -159,36 +161,36 @@ class HeldMessages:
         return replace(message, data=self._file.read(place[1]))
 
     def pop(self, key: Key) -> RawMessage:
-        found = self.get(key)
+        waiting = self.get(key)
         self._num_bytes -= len(self._messages.pop(key).data)
         self._places.pop(key, None)
         if not self._places:
             self._file.seek(0)
             self._file.truncate()
-        return found
+        return waiting
 
 
 def planned_images(
-    log: RawLog, plan: FramePlan, damage: Damage, held: HeldMessages
+    log: RawLog, plan: FramePlan, damage: Damage, waiting: HeldMessages
 ) -> Iterator[tuple[PlannedFrame, list[RawMessage]]]:
     """Yield frames in plan order with colour, depth and mask messages.
 
-    `held` keeps waiting ones; missing frames go to `damage`.
+    `waiting` keeps others; missing frames go to `damage`.
     """
     uses, position, num = plan.uses(), 0, len(plan)
     numbers, planned = dict.fromkeys(uses, 0), plan[0]
 
     def take(topic: str, number: int) -> RawMessage:
         uses[topic][number] -= 1
-        return held.get((topic, number)) if uses[topic][number] else held.pop((topic, number))
+        return waiting.get((topic, number)) if uses[topic][number] else waiting.pop((topic, number))
 
     for message in log.messages(Damage(), set(uses)):  # the survey has counted this damage
         topic, number = message.topic.name, numbers[message.topic.name]
         numbers[topic] = number + 1
         if number >= len(uses[topic]) or not uses[topic][number]:
             continue
-        held.add((topic, number), message)
-        while position < num and all(key in held for key in planned.keys):
+        waiting.add((topic, number), message)
+        while position < num and all(key in waiting for key in planned.keys):
             yield planned, [take(*key) for key in planned.keys]
             position += 1
             if position < num:
@@ -205,38 +207,40 @@ class RosLogSource(FrameSource):
         self.name = log.path.name
         self._log = log
         self._options = options
-        found = survey(log, by_log_time=options.stamps == "log")
+        log_survey = survey(log, by_log_time=options.stamps == "log")
         refuse_if(
-            not found.num_messages and found.damage.count,
-            f"{log.path}: nothing usable before the damage ({''.join(found.damage.notes[:1])})",
+            not log_survey.num_messages and log_survey.damage.count,
+            f"{log.path}: nothing usable before the damage ({''.join(log_survey.damage.notes[:1])})",
             remedy="copy the file again",
         )
         refuse_if(
-            not found.num_messages,
+            not log_survey.num_messages,
             f"{log.path}: the log holds no messages",
             remedy="record it again, or give another file",
         )
         try:
-            self._rig = build_cameras(log, found, options)
+            self._rig = build_cameras(log, log_survey, options)
         except InputError as error:
-            if not found.damage.count:
+            if not log_survey.damage.count:
                 raise
             raise InputError(
-                f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+                f"{error.message}; but the log is damaged: {log_survey.damage.notes[0]}",
                 remedy=f"copy the file again; if this is all there is: {error.remedy}",
             ) from None
-        self._tf = found.tf
-        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.all_notes, *found.tf.notes])
+        self._tf = log_survey.tf
+        self._loss = LossReport(
+            damaged=log_survey.damage.count, notes=[*log_survey.damage.all_notes, *log_survey.tf.notes]
+        )
         self.cameras = tuple(camera.name for camera in self._rig)
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
-        self.joint_names, self.states = joint_records(found, options, loss, joints)
+        self.joint_names, self.states = joint_records(log_survey, options, loss, joints)
         self.joint_topics = JointTopics(
-            topics=found.select_types(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
+            topics=log_survey.select_types(*STATE_TYPES), loss=loss, first_note=first_note, chosen=options.joint_topic
         )
         self._loss = merge_joints(self._loss, loss, first_note)
-        self._plan = self._plan_frames(found)
+        self._plan = self._plan_frames(log_survey)
         self._passes = [Damage()]  # incomplete where a pass ends early
 
     @property
@@ -258,8 +262,8 @@ class RosLogSource(FrameSource):
 
     def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
         """T_world_camera (4, 4) at a time [ns]; None if tf does not know it."""
-        found = next(c for c in self._rig if c.name == camera)
-        return found.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
+        own = next(c for c in self._rig if c.name == camera)
+        return own.pose_at(self._tf, stamp_ns, round(self._options.pose_tolerance_s * SECOND_NS))
 
     @cached_property
     def _digests(self) -> dict[str, str]:
@@ -269,11 +273,11 @@ class RosLogSource(FrameSource):
             file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
         }
 
-    def _plan_frames(self, found: Survey) -> FramePlan:
+    def _plan_frames(self, log_survey: Survey) -> FramePlan:
         plan = FramePlan(self._rig)
         for camera in self._rig:
             (color, color_ns), (depth, depth_ns) = (
-                self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
+                self._images(log_survey, topic) for topic in (camera.color_topic, camera.depth_topic)
             )
             tolerance_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
             pairs = pair_images(color_ns, depth_ns, tolerance_ns)
@@ -286,39 +290,41 @@ class RosLogSource(FrameSource):
                 )
             self._loss.unpaired_color += len(color) - len(pairs)
             self._loss.unpaired_depth += len(depth) - len(pairs)
-            self._add(plan, found, camera, color_ns[pairs[:, 0]], color[pairs[:, 0]], depth[pairs[:, 1]])
+            self._add(plan, log_survey, camera, color_ns[pairs[:, 0]], color[pairs[:, 0]], depth[pairs[:, 1]])
         return plan
 
-    def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
-        stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
+    def _images(self, log_survey: Survey, topic: str) -> tuple[Index, Index]:
+        stamps = np.array(log_survey.topics[topic].stamps_ns, dtype=np.int64)
         refuse_if(
             len(stamps) > 1 and not stamps.any(),
             f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
             remedy="give --stamps log to take the times of logging",
         )
-        kept = first_of_each(stamps)
+        first = first_of_each(stamps)
         num_gaps, num_images, period_ns = dropped(stamps)
-        self._loss.duplicate_images += len(stamps) - len(kept)
+        self._loss.duplicate_images += len(stamps) - len(first)
         self._loss.dropped_images += num_images
         if num_images:
             self._loss.notes.append(
                 f"{topic}: about {num_images} images were dropped in {num_gaps} gaps of a period of"
                 f" {period_ns / 1e6:.4g} ms"
             )
-        return kept, stamps[kept]
+        return first, stamps[first]
 
     def _add(
-        self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
+        self, plan: FramePlan, log_survey: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
     ) -> None:
         tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
         pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
-        masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
-        poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
+        masks = _mask_by_color(
+            log_survey, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss
+        )
+        poses = (camera.pose_at(log_survey.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
         num = plan.add(camera, stamp_ns, color, depth, masks, poses)
         refuse_if(
             not num,
             f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
-            f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+            f" {camera.world_frame!r} at the time of any image ({_times(log_survey, camera)})",
             remedy="check the clocks of the recording, or give --camera-pose",
         )
         self._loss.without_pose += len(color) - num
@@ -392,10 +398,10 @@ def _stored_frame(
     )
 
 
-def _times(found: Survey, camera: Camera) -> str:
-    stamps = found.topics[camera.color_topic].stamps_ns
+def _times(log_survey: Survey, camera: Camera) -> str:
+    stamps = log_survey.topics[camera.color_topic].stamps_ns
     images = f"images {min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s"
-    span = found.tf.span_ns(camera.frame_id)
+    span = log_survey.tf.span_ns(camera.frame_id)
     return images if span is None else f"{images}, tf {span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
 
 

@@ -175,8 +175,8 @@ class StateCollector:
 
     def columns(self) -> StateColumns:
         nothing = np.zeros((0, self._num_joints))
-        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.columns()}
-        return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)
+        tables: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.columns()}
+        return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **tables)
 
 
 def _optional(values: Table | None, first: int, last: int) -> list[Float64 | None]:

@@ -117,8 +117,8 @@ def _controller(message: Any) -> _Read:
     names = message.joint_names
 
     def filled(*fields: str) -> Any:
-        there = (getattr(message, name) for name in fields if name in message.__dataclass_fields__)
-        return next((point for point in there if len(point.positions) == len(names)), None)
+        fields_present = (getattr(message, name) for name in fields if name in message.__dataclass_fields__)
+        return next((point for point in fields_present if len(point.positions) == len(names)), None)
 
     what = f"a controller state of {len(names)} joints without positions"
     actual = require(filled("feedback", "actual"), what, error=UndecodableMessageError)

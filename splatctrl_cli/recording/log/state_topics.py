@@ -34,24 +34,24 @@ _COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoi
 
 
 def joint_records(
-    survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
+    survey: Survey, options: SourceOptions, loss: LossReport, joints: Sequence[str] | None = None
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `wanted` (a robot's joints), their topics are merged. Else one topic is used; states of other joints than its
+    With `joints` (a robot's), their topics are merged. Else one topic is used; states of other joints than its
     fullest are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
         return (), NO_STATES
     try:
-        refuse_contradiction(topics, wanted)
+        refuse_contradiction(topics, joints)
     except SplatCtrlError as wrong:
-        if wanted is not None:
+        if joints is not None:
             raise
         loss.notes.append(wrong.message)
     loss.notes += [f"{t.topic.name}: {note} ({num} states)" for t in topics for note, num in t.joints.notes.items()]
-    raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
+    raw = track_of_topic(main_topic(topics, loss), loss) if joints is None else track_of_joints(topics, joints, loss)
     states = clean_states(raw, loss)
     return (raw.names, states) if len(states) else ((), NO_STATES)
 
@@ -61,20 +61,20 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
     Raises InputError for an unknown --joint-topic.
     """
-    found = [t for t in survey.select_types(*STATE_TYPES) if t.joints.streams]
+    topics = [t for t in survey.select_types(*STATE_TYPES) if t.joints.streams]
     for topic in survey.select_types(*STATE_TYPES):
         if not topic.topic.definition and topic.topic.type_name not in STANDARD_TYPES:
             kind = topic.topic.type_name
             loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
     if options.joint_topic is not None:
-        chosen = [t for t in found if t.topic.name == options.joint_topic]
+        chosen = [t for t in topics if t.topic.name == options.joint_topic]
         refuse_if(
             not chosen,
             f"joint topic {options.joint_topic}: not a topic of the log with joint states",
-            remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
+            remedy=f"use one of: {', '.join(t.topic.name for t in topics) or 'none there'}",
         )
         return chosen
-    return [t for t in found if t.topic.type_name != TRAJECTORY] or found
+    return [t for t in topics if t.topic.type_name != TRAJECTORY] or topics
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
@@ -104,16 +104,16 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
     return _check_clock(chosen, loss)
 
 
-def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
-    """Merge the states of the joints `wanted` from as few topics as possible.
+def track_of_joints(topics: Sequence[TopicSurvey], joints: Sequence[str], loss: LossReport) -> RawTrack:
+    """Merge the states of `joints` from as few topics as possible.
 
     The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
     interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
     """
-    tracks = _rename_joints(_tracks(topics), wanted, loss)
-    base = _base(tracks, wanted)
+    tracks = _rename_joints(_tracks(topics), joints, loss)
+    base = _base(tracks, joints)
     track = _check_clock(base, loss)
-    missing = [name for name in wanted if name not in base.names]
+    missing = [name for name in joints if name not in base.names]
     used = [base.where]
     while missing:
         best = max(tracks, key=lambda t: (len(set(t.names) & set(missing)), len(t), t.where))
@@ -128,26 +128,26 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
         loss.notes.append(
             f"joint states are taken from {', '.join(dict.fromkeys(used))}, not from {', '.join(others)}"
         )
-    return track if missing else track.select_names(wanted)
+    return track if missing else track.select_names(joints)
 
 
 def _tracks(topics: Sequence[TopicSurvey]) -> list[RawTrack]:
-    found = []
+    tracks = []
     for topic in topics:
         for stream in topic.joints.streams.values():
             names, columns = stream.names, stream.columns()
             if "velocity" not in columns:
                 columns["velocity"] = absent(len(stream), len(names))
             stamp_ns, log_ns, where = stream.stamp_ns, stream.log_time_ns, topic.topic.name
-            found.append(RawTrack(where=where, names=names, stamp_ns=stamp_ns, log_ns=log_ns, **columns))
-    return found
+            tracks.append(RawTrack(where=where, names=names, stamp_ns=stamp_ns, log_ns=log_ns, **columns))
+    return tracks
 
 
-def _base(tracks: Sequence[RawTrack], wanted: Sequence[str]) -> RawTrack:
+def _base(tracks: Sequence[RawTrack], joints: Sequence[str]) -> RawTrack:
     return max(
         tracks,
         key=lambda track: (
-            len(set(track.names) & set(wanted)),
+            len(set(track.names) & set(joints)),
             track.T_base_ee is not None,
             track.where == "/joint_states",
             not _is_command(track.where),
@@ -161,19 +161,19 @@ def _is_command(topic: str) -> bool:
     return any(word in topic.lower() for word in _COMMANDS)
 
 
-def refuse_contradiction(topics: Sequence[TopicSurvey], wanted: Sequence[str] | None) -> None:
-    """Raise if the states of joints `wanted` (None: all) come from two robots.
+def refuse_contradiction(topics: Sequence[TopicSurvey], joints: Sequence[str] | None) -> None:
+    """Raise if the states of `joints` (None: all) come from two robots.
 
     InputError if another topic, not of commands, has them over `STATES_RIVAL` apart; NotEvaluableError if two
     publishers take turns on one topic.
     """
     tracks = _tracks(topics)
-    if wanted is None:
+    if joints is None:
         base = max(tracks, key=lambda t: (t.where == main_topic(topics, LossReport()).topic.name, len(t.names)))
     else:
-        tracks = _rename_joints(tracks, wanted, LossReport())
-        base = _base(tracks, wanted)
-    names = base.names if wanted is None else tuple(name for name in base.names if name in wanted)
+        tracks = _rename_joints(tracks, joints, LossReport())
+        base = _base(tracks, joints)
+    names = base.names if joints is None else tuple(name for name in base.names if name in joints)
     for other in tracks:
         shared = [name for name in names if name in other.names]
         if other.where == base.where or not shared or _is_command(other.where):
@@ -223,26 +223,26 @@ def _num_turns(track: RawTrack, names: Sequence[str]) -> int:
     return num
 
 
-def _rename_joints(tracks: list[RawTrack], wanted: Sequence[str], loss: LossReport) -> list[RawTrack]:
-    found = dict.fromkeys(name for track in tracks for name in track.names)
-    unknown, missing = [n for n in found if n not in wanted], [name for name in wanted if name not in found]
+def _rename_joints(tracks: list[RawTrack], joints: Sequence[str], loss: LossReport) -> list[RawTrack]:
+    logged = dict.fromkeys(name for track in tracks for name in track.names)
+    unknown, missing = [n for n in logged if n not in joints], [name for name in joints if name not in logged]
     names = match_prefix(unknown, missing)
     if not names:
         return tracks
-    name, meant = next(iter(names.items()))
-    loss.notes.append(f"joint names differ by a prefix: {name} is {meant}, and so on")
+    name, joint = next(iter(names.items()))
+    loss.notes.append(f"joint names differ by a prefix: {name} is {joint}, and so on")
     return [replace(t, names=tuple(names.get(name, name) for name in t.names)) for t in tracks]
 
 
-def match_prefix(found: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
+def match_prefix(logged: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
     """Map a log's joint names to the robot's by the best prefix, else empty."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
-    for name in dict.fromkeys(found):
-        for meant in wanted:
-            longer, shorter = (name, meant) if len(name) > len(meant) else (meant, name)
+    for name in dict.fromkeys(logged):
+        for joint in joints:
+            longer, shorter = (name, joint) if len(name) > len(joint) else (joint, name)
             prefix = longer.removesuffix(shorter)
             if len(prefix) < len(longer) and prefix.endswith(("_", "/", ".", ":", "-")):
-                by_prefix.setdefault((prefix, longer == name), {})[name] = meant
+                by_prefix.setdefault((prefix, longer == name), {})[name] = joint
     fitting = sorted(by_prefix.values(), key=len)[-2:]
     is_sure = bool(fitting) and len(fitting[-1]) > 1 and (len(fitting) == 1 or len(fitting[0]) < len(fitting[1]))
     return fitting[-1] if is_sure else {}

@@ -62,10 +62,10 @@ def merge_joints(loss: LossReport, joints: LossReport, at: int, *, sign: int = 1
     return loss.plus(joints, [*loss.notes[:at], *added, *loss.notes[after:]], sign=sign)
 
 
-def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
+def write_topics(folder: Path, joints: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
     """Write streams into a capture; `wrote` gets each file. Returns the capture.json entry."""
     described, number = [], 0
-    for topic in kept.topics:
+    for topic in joints.topics:
         streams = []
         for stream in topic.joints.streams.values():
             place = f"{FOLDER}/{number}"
@@ -93,8 +93,8 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
         )
     return {
         "topics": described,
-        "chosen": kept.chosen,
-        "loss": {"counts": asdict(kept.loss), "first_note": kept.first_note},
+        "chosen": joints.chosen,
+        "loss": {"counts": asdict(joints.loss), "first_note": joints.first_note},
     }
 
 

@@ -57,9 +57,9 @@ def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArra
         for a, b in zip(i[block].tolist(), j[block].tolist(), strict=True):
             if is_free[b] and partner[a] < 0:
                 is_free[b], partner[a] = False, b
-    found = np.flatnonzero(partner >= 0)
-    found = found[np.argsort(color[found], kind="stable")]
-    return np.stack([found, partner[found]], axis=1)
+    paired = np.flatnonzero(partner >= 0)
+    paired = paired[np.argsort(color[paired], kind="stable")]
+    return np.stack([paired, partner[paired]], axis=1)
 
 
 @dataclass(kw_only=True)
@@ -168,8 +168,8 @@ class Survey:
 
     def select_types(self, *types: str) -> list[TopicSurvey]:
         """Non-empty topics of these types, sorted by name."""
-        found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
-        return sorted(found, key=lambda t: t.topic.name)
+        topics = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
+        return sorted(topics, key=lambda t: t.topic.name)
 
 
 def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
@@ -305,34 +305,34 @@ def _sample(
     chunks: Sequence[ChunkIndex],
     video: VideoLog | None,
 ) -> Survey:
-    found, decoder = Survey(), MessageDecoder()
-    messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
+    sample, decoder = Survey(), MessageDecoder()
+    messages = log.messages_of(chunks, sample.damage) if chunks else islice(log.messages(Damage()), 2000)
     messages = messages if video is None else video.decoded(messages, Damage())  # others lie between these chunks
     for message in messages:
-        add_message(found, decoder, message)
+        add_message(sample, decoder, message)
     for topic in log.topics():
-        found.topics.setdefault(topic.name, TopicSurvey(topic=topic))
-    for entry in found.topics.values():
+        sample.topics.setdefault(topic.name, TopicSurvey(topic=topic))
+    for entry in sample.topics.values():
         entry.count = 0
     for channel, count in counts.items():
         counted = log.channels.get(channel)
         if counted is not None:
-            entry = found.topics[counted.name]
+            entry = sample.topics[counted.name]
             entry.count += count
             entry.first_log_ns = entry.first_log_ns or span_ns[0]
             entry.last_log_ns = span_ns[1]
-    return found
+    return sample
 
 
 def _first_chunks(counts: Mapping[int, int], chunks: Sequence[ChunkIndex]) -> list[ChunkIndex]:
-    wanted = {chunk.chunk_start_offset: chunk for chunk in chunks[:4]}
+    by_offset = {chunk.chunk_start_offset: chunk for chunk in chunks[:4]}
     for channel in sorted(counts):
         first = next((c for c in chunks if channel in c.message_index_offsets), None)
         if first is not None:
-            wanted[first.chunk_start_offset] = first
+            by_offset[first.chunk_start_offset] = first
     chosen: list[ChunkIndex] = []
     size = 0
-    for _, chunk in sorted(wanted.items())[:24]:
+    for _, chunk in sorted(by_offset.items())[:24]:
         size += max(chunk.uncompressed_size, chunk.compressed_size)
         if size <= _MOST_BYTES or not chosen:
             chosen.append(chunk)
@@ -349,21 +349,21 @@ def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     of_events = {t.name for t in topics if t.type_name == EVENT} if topics else {f"/{NAME}", EVENTS}  # no index
-    wanted = own or of_events
-    found: dict[str, str] = {}
+    names = own or of_events
+    by_text: dict[str, str] = {}
     decoder = MessageDecoder()
-    for message in log.messages(Damage(), wanted) if wanted else ():
+    for message in log.messages(Damage(), names) if names else ():
         try:
-            said = decoder.decode(message)
+            content = decoder.decode(message)
         except UndecodableMessageError:
             continue  # the survey counts it
         if message.topic.type_name == STRING:
-            found.setdefault(message.topic.name, str(said.data))
+            by_text.setdefault(message.topic.name, str(content.data))
         elif message.topic.type_name == EVENT:
-            set_now = (*said.new_parameters, *said.changed_parameters)
+            set_now = (*content.new_parameters, *content.changed_parameters)
             texts = [str(p.value.string_value) for p in set_now if p.name == NAME and p.value.type == _TEXT]
-            found |= {str(said.node): text for text in texts}
-        if own and own <= found.keys():
+            by_text |= {str(content.node): text for text in texts}
+        if own and own <= by_text.keys():
             break
-    where = {text: name for name, text in reversed(found.items()) if text.strip()}
+    where = {text: name for name, text in reversed(by_text.items()) if text.strip()}
     return [(name, text) for text, name in reversed(where.items())]

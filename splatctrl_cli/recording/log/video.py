@@ -141,13 +141,13 @@ def _decode(context: Any, data: bytes | None, number: int) -> tuple[list[Any], b
     av.logging.set_level(av.logging.DEBUG)
     av.logging.set_skip_repeated(False)
     try:
-        with av.logging.Capture(local=True) as said:
+        with av.logging.Capture(local=True) as captured:
             frames, is_broken = list(context.decode(packet)), False
     except av.FFmpegError:
         frames, is_broken = [], True
     finally:
         av.logging.set_level(level)
-    return frames, is_broken or any(how <= av.logging.ERROR or _GAP in words for how, _, words in said)
+    return frames, is_broken or any(how <= av.logging.ERROR or _GAP in words for how, _, words in captured)
 
 
 def _lose(stream: _Stream, numbers: list[int]) -> None:
@@ -203,8 +203,8 @@ class VideoFileLog(RawLog):
         """Yield the images. Raises InputError if they and the stamps differ in number."""
         if names is not None and self.channels[0].name not in names:
             return
-        num, found = 0, Damage()
-        for frame in self._frames(found):
+        num, losses = 0, Damage()
+        for frame in self._frames(losses):
             if frame is not None and num < len(self._stamps):
                 seconds, nanoseconds = divmod(int(self._stamps[num]), SECOND_NS)
                 header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id="")
@@ -215,10 +215,10 @@ class VideoFileLog(RawLog):
                     file=self.path.name,
                 )
             num += 1
-        for note in found.notes:
+        for note in losses.notes:
             damage.add(note)
         refuse_if(
-            num != len(self._stamps) and not found.count,
+            num != len(self._stamps) and not losses.count,
             f"{self.path}: {num} images, but {len(self._stamps)} stamps in {self.files[1].name}",
             remedy="write a stamp for each image of the file",
         )
@@ -253,10 +253,10 @@ def _read_stamps(path: Path) -> Stamps:
         f"{path}: expected a stamp a line, or columns whose first line names one time or stamp",
         remedy="write the images' times alone, in seconds",
     )
-    found = [_number(row[column]) if column < len(row) else None for row in rows]
-    values = [value for value in found if value is not None]
+    numbers = [_number(row[column]) if column < len(row) else None for row in rows]
+    values = [value for value in numbers if value is not None]
     if len(values) < len(rows):
-        line = lines[found.index(None)]
+        line = lines[numbers.index(None)]
         raise InputError(f"{path}: expected a time, got {line[:80]!r}", remedy="correct the line")
     digits = len(str(abs(int(values[0]))))
     unit_ns = next(unit for most, unit in _UNITS_NS if digits <= most)

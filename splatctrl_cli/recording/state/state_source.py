@@ -103,15 +103,17 @@ def _open_log_states(
         if any(getattr(options, name) != getattr(default, name) for name in _FOR_CAMERAS):
             raise  # somebody asked for these cameras
         reason = error
-    found = survey(log, by_log_time=options.stamps == "log")
-    if not found.num_messages:
+    log_survey = survey(log, by_log_time=options.stamps == "log")
+    if not log_survey.num_messages:
         raise reason
     loss = LossReport(
-        damaged=found.damage.count, notes=[*found.damage.all_notes, f"no camera is used: {reason.message}"]
+        damaged=log_survey.damage.count, notes=[*log_survey.damage.all_notes, f"no camera is used: {reason.message}"]
     )
-    names, states = joint_records(found, options, loss, joints)
+    names, states = joint_records(log_survey, options, loss, joints)
     if not states:
-        topics = ", ".join(f"{name} ({t.topic.type_name})" for name, t in sorted(found.topics.items()) if t.count)
+        topics = ", ".join(
+            f"{name} ({t.topic.type_name})" for name, t in sorted(log_survey.topics.items()) if t.count
+        )
         raise InputError(
             f"{path}: expected joint states, got none", remedy=f"the log holds {topics or 'no messages'}"
         )
@@ -183,7 +185,7 @@ def read_twists(path: Path, topic: str) -> LoggedTwists:
 
 def _read_logged(path: Path, topic: str) -> LoggedTwists:
     log, decoder, damage = open_raw_log(path), MessageDecoder(), Damage()
-    kinds: dict[str, str] = {found.name: found.type_name for found in log.topics()}
+    kinds: dict[str, str] = {entry.name: entry.type_name for entry in log.topics()}
     stamps, log_times, twists, frames = [], [], [], []
     for message in log.messages(damage, {topic}):
         kind = message.topic.type_name
@@ -201,10 +203,10 @@ def _read_logged(path: Path, topic: str) -> LoggedTwists:
         stamps.append(stamp_ns(content.header) if kind == STAMPED else 0)
         frames.append(content.header.frame_id.strip("/") if kind == STAMPED else "")
     if not twists:
-        there = ", ".join(sorted(name for name, kind in kinds.items() if kind in (TWIST, STAMPED)))
+        twist_topics = ", ".join(sorted(name for name, kind in kinds.items() if kind in (TWIST, STAMPED)))
         raise InputError(
             f"{path}: topic {topic}: expected {STAMPED} or {TWIST}, got {kinds.get(topic, 'no message')}",
-            remedy=f"topics with twists: {there or 'none'}",
+            remedy=f"topics with twists: {twist_topics or 'none'}",
         )
     notes = [f"{len(damage.notes)} messages do not decode: left out"] if damage.count else []
     if not any(stamps):
@@ -225,10 +227,10 @@ def _read_described(path: Path, name: str) -> LoggedTwists:
         f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",
         remedy=_SEE,
     )
-    stamps, found = columns_of(path, TABLE, table.file).read(
+    stamps, columns = columns_of(path, TABLE, table.file).read(
         table.time, TIME_UNITS_NS[table.time_unit], {"twist": [*table.linear, *table.angular]}, table.epoch_ns
     )
-    twists = found["twist"][: len(found["twist"])]
+    twists = columns["twist"][: len(columns["twist"])]
     refuse_if(
         twists.shape != (len(stamps), 6),
         f"{path}: {TABLE}: expected 6 columns of {len(stamps)} rows, got {twists.shape[::-1]}",

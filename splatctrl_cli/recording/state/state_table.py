@@ -138,23 +138,23 @@ def libfranka_track(table: CsvTable) -> RawTrack:
         remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
     )
     sent, desired = _sent(table, num), _block(table, "dq_d", num)
-    wanted = {
+    groups = {
         "position": position,
         "velocity": _block(table, "dq", num),
         "sent": sent,
         "desired": desired if desired != sent else None,
         "pose": _block(table, "O_T_EE", 16),
     }
-    stamps, found = table.read(0, 1_000_000, {name: of for name, of in wanted.items() if of is not None})
-    pose, velocity = found.get("pose"), found.get("velocity")
-    has_sent = "sent" in found and any(np.nan_to_num(rows).any() for rows in blocks_of(found["sent"]))
+    stamps, columns = table.read(0, 1_000_000, {name: of for name, of in groups.items() if of is not None})
+    pose, velocity = columns.get("pose"), columns.get("velocity")
+    has_sent = "sent" in columns and any(np.nan_to_num(rows).any() for rows in blocks_of(columns["sent"]))
     return RawTrack(
         where=table.path.name,
         names=NAMELESS,
         stamp_ns=stamps,
-        position=found["position"],
+        position=columns["position"],
         velocity=absent(len(stamps), num) if velocity is None else velocity,
-        commanded_velocity=found["sent"] if has_sent else found.get("sent" if desired == sent else "desired"),
+        commanded_velocity=columns["sent"] if has_sent else columns.get("sent" if desired == sent else "desired"),
         T_base_ee=None if pose is None else poses_of(pose, pose_of_columns),
     )
 
@@ -202,8 +202,10 @@ def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
         remedy="describe the columns in a .toml (splatctrl help replay, Logs)",
     ):
         feature, num = info["features"][POSITION], int(info["total_episodes"])
-        size, said = int(feature["shape"][0]), feature.get("names")
-        lists = said.values() if isinstance(said, dict) else [said or []]  # by kind, as {"motors": [...]}
+        size, feature_names = int(feature["shape"][0]), feature.get("names")
+        lists = (
+            feature_names.values() if isinstance(feature_names, dict) else [feature_names or []]
+        )  # by kind, as {"motors": [...]}
         names = [
             str(name).removesuffix(".pos") for names in lists for name in names
         ]  # shoulder_pan.pos is shoulder_pan
@@ -225,8 +227,8 @@ def _file(folder: Path, episode: int) -> Path:
     files = sorted((folder / "data").glob("*/*.parquet"))
     of_one = [file for file in files if file.stem == f"episode_{episode:06d}"]
     shared = (file for file in files if file.stem.startswith("file") and len(ParquetFile(file, (EPISODE, episode))))
-    found, remedy = next(iter(of_one), None) or next(shared, None), "copy the whole dataset, or give another episode"
-    return require(found, f"{folder}: no episode {episode}", remedy=remedy)
+    path, remedy = next(iter(of_one), None) or next(shared, None), "copy the whole dataset, or give another episode"
+    return require(path, f"{folder}: no episode {episode}", remedy=remedy)
 
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
@@ -266,7 +268,9 @@ class StatesTable:
 
 def read_described_track(path: Path) -> tuple[RawTrack, Path]:
     """Read described states, and their file. Raises InputError naming key or column."""
-    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: fill_preset(path, given))
+    table = read_table(
+        StatesTable, path, "states", beside=("twists",), fill=lambda content: fill_preset(path, content)
+    )
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
@@ -291,26 +295,26 @@ def read_described_track(path: Path) -> tuple[RawTrack, Path]:
 
 def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
     """A LeRobot dataset's only episode, and its file. Raises InputError."""
-    found = dict(lerobot_preset(folder, None))
+    preset = dict(lerobot_preset(folder, None))
     refuse_if(
-        "joints" not in found,
+        "joints" not in preset,
         f"{folder / INFO}: {POSITION} has no name for each joint",
         remedy="give a .toml: [states] preset, file, joints (splatctrl help replay, Logs)",
     )
-    file = Path(found["file"])
-    return _track(StatesTable(**found), ParquetFile(file, (EPISODE, found["episode"])), folder), file
+    file = Path(preset["file"])
+    return _track(StatesTable(**preset), ParquetFile(file, (EPISODE, preset["episode"])), folder), file
 
 
-def fill_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
+def fill_preset(path: Path, keys: Mapping[str, Any]) -> Mapping[str, Any]:
     """Fill [states] of TOML file `path` by its preset."""
-    name = given.get("preset", "")
+    name = keys.get("preset", "")
     if not name:
-        return given
+        return keys
     refuse_if(
         name not in PRESETS, f"{path}: states.preset: expected one of {', '.join(PRESETS)}, got {name!r}", remedy=_SEE
     )
-    found = PRESETS[name](path.parent / str(given.get("file", ".")), given.get("episode"))
-    return {**found, **given, "file": found["file"]}
+    preset = PRESETS[name](path.parent / str(keys.get("file", ".")), keys.get("episode"))
+    return {**preset, **keys, "file": preset["file"]}
 
 
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
@@ -325,23 +329,23 @@ def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
 
 def _track(table: StatesTable, columns: CsvTable | ArrayFile, path: Path) -> RawTrack:
     factor, num = UNITS[table.unit], len(table.joints)
-    wanted = {"position": table.position, "velocity": table.velocity}
-    wanted |= {"commanded_velocity": table.commanded_velocity, "pose": table.pose}
-    stamps, found = columns.read(
+    groups = {"position": table.position, "velocity": table.velocity}
+    groups |= {"commanded_velocity": table.commanded_velocity, "pose": table.pose}
+    stamps, values = columns.read(
         table.time,
         TIME_UNITS_NS[table.time_unit],
-        {key: names for key, names in wanted.items() if names or key == "position"},
+        {key: names for key, names in groups.items() if names or key == "position"},
         table.epoch_ns,
     )
-    for key, block in found.items():
+    for key, block in values.items():
         refuse_if(
             key != "pose" and block.shape != (len(stamps), num),
             f"{path}: states.{key}: expected {num} columns of {len(stamps)} states, got {block.shape[::-1]}",
             remedy="one column per joint",
         )
-    position, velocity = scaled(found["position"], factor), found.get("velocity")
-    commanded = found.get("commanded_velocity")
-    poses = _poses(table, found.get("pose"), path, len(stamps))
+    position, velocity = scaled(values["position"], factor), values.get("velocity")
+    commanded = values.get("commanded_velocity")
+    poses = _poses(table, values.get("pose"), path, len(stamps))
     return RawTrack(
         where=Path(table.file).name,
         names=tuple(table.joints),
