@@ -166,7 +166,7 @@ class _CameraWatch:
                 intrinsics=strided_lens(self.lens, depth.stride),
                 T_world_camera=poses[depth.stamp_ns],
             )
-            for depth, color in zip(self.images.kept, self.colors.kept, strict=True)
+            for depth, color in zip(self.images.samples, self.colors.samples, strict=True)
         ]
 
 

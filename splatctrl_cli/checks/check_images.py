@@ -50,7 +50,7 @@ class ImageWatch:
         self.sizes: Counter[tuple[int, int]] = Counter()
         self.medians: Thinned[float] = Thinned(1000)
         self.shares: Thinned[float] = Thinned(1000)
-        self.kept: Thinned[Thumbnail] = Thinned(limits.KEPT_IMAGES)
+        self.samples: Thinned[Thumbnail] = Thinned(limits.KEPT_IMAGES)
         self.thumbnails: list[tuple[int, NDArray[Any]]] = []
         self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
@@ -73,7 +73,7 @@ class ImageWatch:
         stride = stride_of(height)
         size = (-(-width // stride), -(-height // stride))
         self._add(stamp_ns, color, encoding, cv2.INTER_AREA)
-        if self.kept.is_next():
+        if self.samples.is_next():
             self._keep(stamp_ns, color, np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.uint8))
 
     def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
@@ -91,7 +91,7 @@ class ImageWatch:
             self.shares.add(valid.size / small.size)
         if self.medians.is_next():
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
-        if self.kept.is_next():
+        if self.samples.is_next():
             self._keep(stamp_ns, depth, small.copy())
 
     def _add(self, stamp_ns: int, image: NDArray[Any], encoding: str, interpolation: int) -> None:
@@ -105,7 +105,7 @@ class ImageWatch:
 
     def _keep(self, stamp_ns: int, image: NDArray[Any], small: NDArray[Any]) -> None:
         height, width = image.shape[:2]
-        self.kept.add(
+        self.samples.add(
             Thumbnail(stamp_ns=stamp_ns, stride=stride_of(height), width=width, height=height, pixels=small)
         )
 
@@ -116,7 +116,9 @@ class ImageWatch:
         if factor != 1.0:
             self.constants = Counter({float(value * factor): num for value, num in self.constants.items()})
             self.medians[:] = [float(median * factor) for median in self.medians]
-            self.kept[:] = [replace(k, pixels=k.pixels * factor) if k.pixels.ndim == 2 else k for k in self.kept]
+            self.samples[:] = [
+                replace(k, pixels=k.pixels * factor) if k.pixels.ndim == 2 else k for k in self.samples
+            ]
             self.thumbnails = [(ns, image * factor if image.ndim == 2 else image) for ns, image in self.thumbnails]
 
     @property

@@ -196,12 +196,12 @@ def reduced_frames(
     color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
-    kept_colors = {small.stamp_ns: small for small in (colors.kept if colors is not None else ())}
+    sampled_colors = {small.stamp_ns: small for small in (colors.samples if colors is not None else ())}
     frames = []
-    for small in depths.kept if depths is not None else ():
-        near = min(sorted(kept_colors), key=lambda stamp: abs(stamp - small.stamp_ns), default=None)
+    for small in depths.samples if depths is not None else ():
+        near = min(sorted(sampled_colors), key=lambda stamp: abs(stamp - small.stamp_ns), default=None)
         is_near = near is not None and abs(near - small.stamp_ns) <= options.pairing_tolerance_s * 1e9
-        color = kept_colors[near] if near is not None and is_near else None
+        color = sampled_colors[near] if near is not None and is_near else None
         stamp_ns = small.stamp_ns if color is None else color.stamp_ns
         T = camera.pose_at(tf, stamp_ns - late_ns.get(camera.name, 0), round(options.pose_tolerance_s * 1e9))
         if T is not None:

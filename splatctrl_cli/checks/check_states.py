@@ -276,7 +276,7 @@ def robot_states(model: RobotModel | None, names: Sequence[str], states: StateCo
         return RobotStates(
             model=model, lack=str(wrong), findings=[error("joints", JOINT_STATES, wrong.message, wrong.remedy)]
         )
-    of_fingers = [note("joints", JOINT_STATES, model.held_words)] if model.held else []
+    of_fingers = [note("joints", JOINT_STATES, model.locked_words)] if model.locked else []
     return RobotStates(model=model, states=states, findings=[*of_fingers, *robot_findings(model, states)])
 
 

@@ -29,12 +29,12 @@ class PlanOutcome(StrEnum):
 class Plan:
     """A search's result: waypoints (W, J) [rad] to goal number `goal`, none unless solved.
 
-    found (V, J): path before shortening; num_checks: postures; search_time, shortcut_time [s]: wall clock.
+    raw_path (V, J): path before shortening; num_checks: postures; search_time, shortcut_time [s]: wall clock.
     """
 
     outcome: PlanOutcome
     waypoints: Float64
-    found: Float64
+    raw_path: Float64
     goal: int
     num_iterations: int
     num_edges: int
@@ -167,7 +167,7 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
     return Plan(
         outcome=outcome,
         waypoints=waypoints,
-        found=path,
+        raw_path=path,
         goal=goal,
         num_iterations=search.num_iterations,
         num_edges=search.num_edges,

@@ -36,7 +36,7 @@ class RobotModel:
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without;
     base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out:
     sphere-file links missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None for the
-    reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; held: locked fingers and
+    reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; locked: fingers' fixed
     values.
     """
 
@@ -50,7 +50,7 @@ class RobotModel:
         *,
         are_links_renamed: bool,
         packages: Sequence[Path] = (),
-        held: Mapping[str, float] | None = None,
+        locked: Mapping[str, float] | None = None,
     ) -> None:
         self._model = model
         self.urdf = urdf
@@ -68,7 +68,7 @@ class RobotModel:
         self.self_model: SelfModel | None = None
         self._surfaces: dict[int, RobotSurface] = {}  # by the number of earlier `changes`
         self._packages = packages
-        self.held = dict(held or {})
+        self.locked = dict(locked or {})
         self._chosen_pairs: Index | None = None
         self._allowance: Float64 | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
@@ -126,7 +126,7 @@ class RobotModel:
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
         """Robot for a log of these joints.
 
-        Unmoved fingers and their mimics are locked in the middle of their limits (`held`).
+        Unmoved fingers and their mimics are locked in the middle of their limits (`locked`).
         """
         fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
         if not fingers:
@@ -142,7 +142,7 @@ class RobotModel:
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
-            held={name: locked[name] for name in self.joint_names if name in locked},
+            locked={name: locked[name] for name in self.joint_names if name in locked},
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
@@ -155,7 +155,7 @@ class RobotModel:
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
-            held=self.held,
+            locked=self.locked,
         )
         robot._surface = self.surface.add_boxes(boxes)
         return robot
@@ -228,13 +228,13 @@ class RobotModel:
             (bare, f"{name}: no sphere covers {bare}; the clearance of these links is unknown"),
             (lost, f"spheres of {lost} are left out: {name} has no such link"),
             (self.are_links_renamed, RENAMED),
-            (self.held, self.held_words),
+            (self.locked, self.locked_words),
         )
         return tuple(sentence for is_so, sentence in sentences if is_so)
 
     @property
-    def held_words(self) -> str:
-        values = ", ".join(f"{name} = {value:g}" for name, value in self.held.items())
+    def locked_words(self) -> str:
+        values = ", ".join(f"{name} = {value:g}" for name, value in self.locked.items())
         return f"fingers that the log does not move are locked in their middle: {values}; --lock holds them elsewhere"
 
     @property

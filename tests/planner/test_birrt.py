@@ -41,7 +41,7 @@ def test_a_way_round_a_wall_is_found_and_is_free(margin: float, seed: int) -> No
     found, again = (plan(clearance(one_wall(), margin=margin), START, GOAL, CONFIG, seed=seed) for _ in range(2))
     assert found.is_solved
     np.testing.assert_array_equal(found.waypoints[[0, -1]], [START, GOAL])
-    for waypoints in (found.waypoints, found.found):
+    for waypoints in (found.waypoints, found.raw_path):
         assert densest(room, waypoints) > margin
         assert np.all((waypoints >= arm.lower) & (waypoints <= arm.upper))
     np.testing.assert_array_equal(found.waypoints, again.waypoints)
@@ -105,7 +105,7 @@ def test_a_start_or_goal_that_cannot_be_is_named(
 @pytest.mark.parametrize("seed", range(5))
 def test_shortcuts_are_proved_and_never_longer(seed: int) -> None:
     room = clearance(one_wall())
-    found = plan(room, START, GOAL, replace(CONFIG, shortcut_rounds=0), seed=seed).found
+    found = plan(room, START, GOAL, replace(CONFIG, shortcut_rounds=0), seed=seed).raw_path
     short, _, _ = shorten_path(room, found, CONFIG, np.random.default_rng(seed))
     np.testing.assert_array_equal(short[[0, -1]], found[[0, -1]])
     assert joint_length(short) <= joint_length(found) + 1e-12 and densest(room, short) > 0

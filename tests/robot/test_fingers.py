@@ -66,11 +66,11 @@ def test_fingers_are_locked_in_their_middle_and_what_mimics_them_follows(tmp_pat
     whole = RobotModel.from_urdf(robot(tmp_path, *ARM, *ROBOTIQ), spheres)
     held = whole.moved_by(["wrist", "shoulder"])
     assert held.joint_names == ("shoulder", "wrist")
-    assert held.held == {"knuckle": 0.02, "other": -0.02, "tip": pytest.approx(0.11)}
+    assert held.locked == {"knuckle": 0.02, "other": -0.02, "tip": pytest.approx(0.11)}
     (said,) = held.doubts
     assert said.startswith("fingers that the log does not move are locked in their middle: ")
     assert "knuckle = 0.02" in said and "--lock" in said
-    q = {"shoulder": 0.01, "wrist": 0.03, **held.held}
+    q = {"shoulder": 0.01, "wrist": 0.03, **held.locked}
     same = whole.sphere_centers(np.array([q[name] for name in whole.joint_names]))
     np.testing.assert_allclose(held.sphere_centers(np.array([0.01, 0.03])), same, atol=1e-12)
     assert whole.moved_by(whole.joint_names) is whole
