@@ -123,7 +123,7 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
 
 
 def derive_by_twists(own: Float64, projected: Float64, gradient: Float64, T: Float64) -> Float64:
-    """Derivatives (K, 12) of a value at `there` (K, 3) by two cameras' motions.
+    """Derivatives (K, 12) of a value at `projected` (K, 3) by two cameras' motions.
 
     The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
     Motions are in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by ``(p x

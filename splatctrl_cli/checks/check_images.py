@@ -35,8 +35,8 @@ class Thumbnail:
 class ImageWatch:
     """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` are decoded, then every second, fourth, ... (`is_wanted`). thumbnails: stamp
-    [ns] and image of `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
+    The first `limits.DECODED_IMAGES` are decoded, then ever fewer. thumbnails: stamp [ns] and image of
+    `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:

@@ -12,7 +12,7 @@ FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__pa
 
 
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
-    """Raise UsageError if `write_grid` would fail for `names`: a check before a long bake.
+    """Raise UsageError if `write_grid` would fail for `names`.
 
     unknown: the policy; ``nan`` blanks cells.
     """

@@ -172,7 +172,7 @@ class SceneFolder:
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """Facts that tell if the scene belongs to a log and a robot.
+        """Facts of its log and robot.
 
         Digests (`inputs`), first frames, joints and links, depth correction, and the robot's residual.
         """

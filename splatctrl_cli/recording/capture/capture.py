@@ -214,7 +214,7 @@ _NOT_FOR_CAPTURES = (
 
 
 class CaptureSource(FrameSource):
-    """Records of a capture folder; files with a wrong checksum count as damage.
+    """Records of a capture; files with a wrong checksum are damage.
 
     joints: a robot's, merged from the kept topics; if None, or no topic was kept, the states are joints.npz's.
     """

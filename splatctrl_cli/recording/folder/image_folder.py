@@ -57,7 +57,7 @@ _NOT_FOR_FOLDERS = (
 class ImageFolderSource(FrameSource):
     """Frames of an image folder, without joint states.
 
-    The descriptions, one per camera, differ only in files, lens and poses.
+    Descriptions of several cameras differ only in files, lens and poses.
     """
 
     world_frame = "world"
@@ -101,7 +101,7 @@ class ImageFolderSource(FrameSource):
         )
 
     def _convert_to_metres(self) -> str:
-        """Convert lengths that look like millimetres or centimetres; return a note, or ""."""
+        """Convert lengths in millimetres or centimetres; return a note, or ""."""
         places = np.ptp([view.T_world_camera[:3, 3] for view in self._views], axis=0)
         apart = float(np.linalg.norm(places))  # the diagonal of their box, in the unit of the poses
         for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():

@@ -47,7 +47,7 @@ class Layout:
 
 
 def find_marks(*alternatives: str) -> Callable[[Path], bool]:
-    """Make a test of folders: every name of one alternative; "/" means a folder."""
+    """Make a test of folders: every name of one alternative ("/": a folder)."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))

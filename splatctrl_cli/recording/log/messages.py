@@ -81,7 +81,7 @@ _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMessage:
-    """An image as recorded; a JPEG or PNG is decoded only for its pixels.
+    """An image as recorded, decoded only for its pixels.
 
     width, height [px]. decode: pixels (H, W[, channels]) in `encoding`, or UndecodableMessageError. compressed: JPEG
     or PNG bytes of `pixels`, if any. remark: a deviation from the format.

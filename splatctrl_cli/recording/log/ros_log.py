@@ -354,7 +354,7 @@ class RosLogSource(FrameSource):
 def _images(
     decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
 ) -> list[ImageMessage]:
-    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep.
+    """Colour, depth and mask; is_whole: all decoded, for no capture.
 
     Raises UndecodableMessageError.
     """

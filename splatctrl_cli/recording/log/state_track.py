@@ -112,7 +112,7 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 class RawTrack(StateColumns):
     """States as recorded, in file order; absent velocity is NaN.
 
-    where: its name in messages. log_ns (T,): times of logging [ns], of a log.
+    where: its name in messages. log_ns (T,): log times [ns].
     """
 
     where: str

@@ -64,7 +64,7 @@ def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArra
 
 @dataclass(kw_only=True)
 class StampClock:
-    """A detector of header clocks that go back: a bag in a loop, a reset; single stamps may err.
+    """A detector of header clocks that go back; single stamps may err.
 
     num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
     """
