@@ -152,7 +152,7 @@ def test_cameras_without_a_recorded_pose_are_placed_against_the_one_that_is_held
 def test_cameras_half_a_metre_off_the_robot_are_found_by_a_board_in_its_gripper(
     tmp_path: Path, plain_arm: Path
 ) -> None:
-    setup = Gripped()
+    setup = Gripped(options=replace(MOVING, fps=1.5))
     result = calibrated(setup, tmp_path, board=BOARD, **robot_in(plain_arm))
     check_errors(setup, result)
     assert result.after < 0.002  # the board hides half the arm from one of them
