@@ -55,7 +55,6 @@ def table(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Table:
     simulate(SimulateRequest(out=folder / "log", options=options))
     log = open_raw_log(folder / "log" / "log.mcap")
     states = log_states(survey(log), SourceOptions(), model).states
-    assert states is not None
     frames = check_log(log, SourceOptions(), only_errors=True).frames
     stamps = sorted({frame.stamp_ns for frame in frames})[::2]
     few = [frame for frame in frames if frame.stamp_ns in stamps and frame.camera != "cam3"]

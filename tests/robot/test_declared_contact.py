@@ -44,8 +44,7 @@ def test_a_carried_box_holds_points_of_its_link_while_it_is_carried(tmp_path: Pa
 def test_a_contact_is_expected_at_its_link_place_and_time_alone(tmp_path: Path) -> None:
     entries = declared(tmp_path)
     place = np.array([0.5, 0.0, 0.1])
-    found = entries.find_expected("hand", place, 3.5)
-    assert found.reason == "the peg goes into its hole"
+    assert entries.find_expected("hand", place, 3.5).reason == "the peg goes into its hole"
     assert entries.find_expected("arm", place, 3.5) is None
     assert entries.find_expected("hand", place + 0.2, 3.5) is None
     assert entries.find_expected("hand", place, 4.5) is None

@@ -146,8 +146,7 @@ def test_a_collada_mesh_of_several_parts_is_whole() -> None:
     loading = pytest.importorskip(
         "tools.mujoco.robots", reason="the robots are not installed: pip install -e '.[sim]'"
     )
-    path = loading.robots_folder() / "ur_description/meshes/ur5/visual/wrist1.dae"
-    mesh = load_mesh(path)
+    mesh = load_mesh(loading.robots_folder() / "ur_description/meshes/ur5/visual/wrist1.dae")
     area = 0.5 * np.linalg.norm(np.cross(*np.diff(mesh.corners, axis=1).swapaxes(0, 1)), axis=1).sum()
     assert area == pytest.approx(0.0461, rel=0.01)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.077, 0.085, 0.105], atol=1e-3)

@@ -58,8 +58,7 @@ def test_spheres_of_the_base_and_on_the_first_axis_do_not_move(arm: RobotModel) 
 
 
 def test_no_posture_leaves_the_reach(arm: RobotModel) -> None:
-    rng = np.random.default_rng(0)
-    postures = rng.uniform(arm.lower, arm.upper, (200, 7))
+    postures = np.random.default_rng(0).uniform(arm.lower, arm.upper, (200, 7))
     far = np.linalg.norm(arm.sphere_centers_batch(postures) - arm.base_position, axis=2) + arm.sphere_set.radii
     assert 0.7 * arm.reach() < far.max() <= arm.reach()
 

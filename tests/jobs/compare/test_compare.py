@@ -350,8 +350,7 @@ def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() 
     declared = judged_runs.scales()["replay"]
     for mode in ("audit", "open-loop", "closed-loop"):
         fields = ("exact", "barrier", "certified")
-        names = metric_scales(mode, fields, has_truth=True, has_twists=True)
-        assert set(names) <= set(declared)
+        assert set(metric_scales(mode, fields, has_truth=True, has_twists=True)) <= set(declared)
     assert declared["min_clearance"].better is Better.HIGHER
     assert declared["num_in_collision"].better is Better.LOWER
     assert all(scale.absolute >= 0 and scale.relative >= 0 for scale in declared.values())

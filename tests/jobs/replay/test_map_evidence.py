@@ -99,7 +99,6 @@ def reason(desk: Desk, criterion: str = "map error") -> dict[str, Any]:
 def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) -> None:
     assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
     expected, metrics = conformal_bound(MISSES, 0.99), desk.metrics()
-    assert expected is not None
     assert metrics["map_error_bound"] == pytest.approx(MISSES.max(), abs=1e-4)
     assert metrics["map_error_blocks"] == expected.num_stretches >= 4
     assert metrics["map_error_confidence"] == pytest.approx(expected.num_stretches / (expected.num_stretches + 1))
@@ -263,8 +262,7 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
     recording: Path, tmp_path: Path, arm: RobotModel
 ) -> None:
     asked = request(recording, tmp_path, evidence="3")
-    evidence = open_evidence(asked, arm)
-    shown = [step.stamp_ns for step in evidence.frame_sets()]
+    shown = [step.stamp_ns for step in open_evidence(asked, arm).frame_sets()]
     scene = reconstruct_scene(asked, arm, tmp_path, SILENT)
     scene.at(2**62)
     stamps = {round((stamp - scene.stamps_ns[0]) / 1e9 * 8) for stamp in scene.stamps_ns}

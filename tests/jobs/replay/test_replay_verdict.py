@@ -148,8 +148,7 @@ def test_the_margin_is_kept_up_to_what_a_solver_leaves(stage: Stage, gap: float,
 
 @pytest.mark.parametrize(("gap", "label"), [(0.01, "margin broken"), (-0.01, "contact")])
 def test_the_truth_alone_turns_the_verdict(stage: Stage, gap: float, label: str) -> None:
-    truth = stage.truth(FAR, stage.ball_at_the_end(gap))
-    code, verdict = stage.judged("--truth", str(truth))
+    code, verdict = stage.judged("--truth", str(stage.truth(FAR, stage.ball_at_the_end(gap))))
     assert (code, verdict["label"], decisive(verdict)) == (1, label, {"true clearance": "failed"})
     assert verdict["reasons"][0]["value"] == pytest.approx(gap, abs=1e-5)
     assert "near ball1" in verdict["sentence"]
@@ -157,8 +156,7 @@ def test_the_truth_alone_turns_the_verdict(stage: Stage, gap: float, label: str)
 
 def test_contact_by_the_truth_is_contact_where_the_map_only_breaks_the_margin(stage: Stage) -> None:
     stage.balls = [FAR, stage.ball_at_the_end(0.01)]
-    truth = stage.truth(FAR, stage.ball_at_the_end(-0.01))
-    code, verdict = stage.judged("--truth", str(truth))
+    code, verdict = stage.judged("--truth", str(stage.truth(FAR, stage.ball_at_the_end(-0.01))))
     assert (code, verdict["label"]) == (1, "contact")
     assert verdict["sentence"].startswith("replay: CONTACT") and "true clearance: hand" in verdict["sentence"]
 

@@ -92,8 +92,7 @@ def test_an_arm_that_folds_into_itself_is_in_contact_whatever_its_spheres_are(
 def test_spheres_that_overlap_where_the_links_do_not_are_no_contact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spheres: SphereSet
 ) -> None:
-    desk = desk_of(tmp_path, monkeypatch, spheres, -OPEN, OPEN)
-    found = judged(desk)
+    found = judged(desk_of(tmp_path, monkeypatch, spheres, -OPEN, OPEN))
     assert (found["outcome"], found["value"]) == ("passed", pytest.approx(0.022, abs=1e-4))
 
 
@@ -293,7 +292,6 @@ def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredR
 
 
 def nearest(robot: MeasuredRobot, q: Float64) -> float:
-    assert robot.surfaces is not None
     return float(robot.surfaces.gaps(q[None], robot.model.sphere_centers_batch(q[None]), 0.02).min())
 
 

@@ -136,8 +136,7 @@ def test_a_run_that_one_device_began_goes_on_on_the_other(
 def test_a_card_that_is_lost_ends_the_run_by_name_and_it_goes_on_elsewhere(
     views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lost = Fails(15, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS"))
-    cards(monkeypatch, lost)
+    cards(monkeypatch, Fails(15, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS")))
     assert reconstruct(views, tmp_path / "scene", "--device", "cuda", "-q") == 70
     (line,) = capsys.readouterr().err.splitlines()
     assert "cuda:0 (Card, driver 580.1): CUDA_ERROR_ILLEGAL_ADDRESS; " in line
@@ -209,8 +208,7 @@ def test_auto_goes_on_where_the_run_was(
             monkeypatch.setattr(device, "open_device", no_card)
         capsys.readouterr()
         assert reconstruct(views, tmp_path / name, "--resume") == 0
-        found = run_of(tmp_path / name)["metrics"]["devices"]
-        assert [each["device"] for each in found] == ends
+        assert [each["device"] for each in run_of(tmp_path / name)["metrics"]["devices"]] == ends
         assert ("computes on cpu: no NVIDIA driver" in capsys.readouterr().err) == (not has_card)
 
 

@@ -47,7 +47,6 @@ def place(tmp_path_factory: pytest.TempPathFactory, views: list[DtuView]) -> Pat
     shutil.rmtree(write_idr(folder / "blind", "scan1", views) / "depth")
     for number, view in enumerate(views):
         (folder / "masks").mkdir(exist_ok=True)
-        assert view.mask is not None
         cv2.imwrite(str(folder / "masks" / f"{number:03d}.png"), np.where(view.mask, 255, 0).astype(np.uint8))
     arguments = ["reconstruct", "--dtu", str(folder / "mvsnet"), "--protocol", HOLDOUT, "-o", str(folder / "scene")]
     assert main([*arguments, *QUICK]) == 0
@@ -293,8 +292,7 @@ def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
 
 
 def test_another_recording_may_be_scored_and_is_named(place: Path, views: list[DtuView], tmp_path: Path) -> None:
-    dark = [replace(view, color=view.color // 2) for view in views]
-    write_dtu(tmp_path / "other", "scan1", dark)
+    write_dtu(tmp_path / "other", "scan1", [replace(view, color=view.color // 2) for view in views])
     expect_refusal("camera: the picture differs by up to ", scored, place, tmp_path / "other")
     result = scored(place, tmp_path / "other", allow_other_recording=True)
     assert any(note.startswith("another recording: camera: the picture differs by up to") for note in result.notes)

@@ -44,7 +44,6 @@ def told(run: Path) -> list[str]:
 def test_a_margin_flips_where_the_log_says_and_both_runs_are_kept_as_folders(tmp_path: Path) -> None:
     run = run_of(tmp_path, failed={"margin": [[0.0437, 9]]})
     flip = swept(run, "margin=0.02:0.1", tolerance=0.01).flips[0]
-    assert flip.last is not None and flip.first is not None
     assert flip.last.values["margin"] < 0.0437 <= flip.first.values["margin"] <= flip.last.values["margin"] + 0.0008
     assert flip.sentence.startswith("margin: SAFE up to 0.0")
     folders = [read_judged(tmp_path / "sweep" / each.folder) for each in (flip.last, flip.first)]
@@ -57,8 +56,7 @@ def test_a_sweep_twice_runs_nothing_and_writes_the_same_bytes(tmp_path: Path) ->
     swept(run, "margin=0.02:0.1")
     file = tmp_path / "sweep" / "sweep.json"
     before, runs = file.read_bytes(), told(run)
-    again = swept(run, "margin=0.02:0.1")
-    assert (file.read_bytes(), told(run), again.num_new) == (before, runs, 0)
+    assert (file.read_bytes(), told(run), swept(run, "margin=0.02:0.1").num_new) == (before, runs, 0)
     swept(run, "margin=0.02:0.1", out="other", workers=2)
     assert (tmp_path / "other" / "sweep.json").read_bytes() == before
 
