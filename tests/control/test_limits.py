@@ -101,8 +101,7 @@ def test_accelerations_come_for_all_joints_or_one_by_one(tmp_path: Path) -> None
     ],
 )
 def test_an_acceleration_that_cannot_be_is_refused(value: float | tuple[float, ...], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        limits(value)  # type: ignore[arg-type]
+    expect_refusal(words, limits, value, error=UsageError)
 
 
 def test_the_fr3_limits_are_those_that_are_published() -> None:

@@ -181,8 +181,7 @@ def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> Non
     ],
 )
 def test_options_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        RecordingOptions(**options)
+    expect_refusal(message, RecordingOptions, error=UsageError, **options)
 
 
 def truth_of(recording: Recording, path: Path) -> Truth:

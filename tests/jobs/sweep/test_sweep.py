@@ -137,16 +137,13 @@ def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
     ],
 )
 def test_a_range_that_is_none_is_refused_before_any_run(tmp_path: Path, over: str, words: str) -> None:
-    run = run_of(tmp_path)
-    with pytest.raises(UsageError) as refused:
-        swept(run, over)
-    assert words in str(refused.value)
+    expect_refusal(words, swept, run_of(tmp_path), over, error=UsageError)
     assert not (tmp_path / "sweep").exists()
 
 
 def test_a_run_that_is_not_evaluable_has_nothing_to_flip(tmp_path: Path) -> None:
-    with pytest.raises(NotEvaluableError, match="there is no verdict to flip"):
-        swept(run_of(tmp_path / "a", outcome="not evaluable"), "margin=0.02:0.1")
+    run = run_of(tmp_path / "a", outcome="not evaluable")
+    expect_refusal("there is no verdict to flip", swept, run, "margin=0.02:0.1", error=NotEvaluableError)
     lacking = run_of(tmp_path / "b", lacking={"latency": [[0, 1]]})
     expect_refusal(r"latency=0\.5: there is no verdict", swept, lacking, "latency=0.5:2", error=NotEvaluableError)
 
