@@ -23,11 +23,11 @@ __all__ = ["painted", "parsed_once", "unpainted"]
 
 @pytest.fixture(scope="package", autouse=True)
 def few_points() -> Iterator[None]:
-    """Compare fewer points between views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
+    """Compare fewer images and points of views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
+    few = {"VIEWS_PAIRS": 10, "VIEWS_POINTS": 400, "VIEWS_LANDED": 200, "EXPOSURE_FRAMES": 3}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limits, "VIEWS_PAIRS", 10)
-        patch.setattr(limits, "VIEWS_POINTS", 400)
-        patch.setattr(limits, "VIEWS_LANDED", 200)
+        for name, value in few.items():
+            patch.setattr(limits, name, value)
         patch.setattr(fixed, "NEAR_MOVED", 0.03)
         yield
 

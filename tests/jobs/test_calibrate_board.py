@@ -108,7 +108,7 @@ class Lying(Turning):
     amount = 0.6
 
     def __init__(self) -> None:
-        super().__init__(has_wrist=True, options=replace(MOVING, fps=4.0))
+        super().__init__(has_wrist=True, options=replace(MOVING, duration_s=2.0, fps=5.0))
 
     def board(self, seconds: float) -> Float64 | None:
         eye = self.hand(0.0) @ T_HAND_WRIST
