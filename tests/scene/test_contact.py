@@ -96,18 +96,13 @@ def test_gaps_at_a_fixed_link_are_filled_where_a_surface_lasts(
 
 
 def test_the_first_map_is_filled_before_anything_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = list[np.ndarray]()
-
-    def record(*given: Any) -> np.ndarray:
-        calls.append(given[2][0])
-        return np.zeros(len(given[4]), bool)
-
-    monkeypatch.setattr(fitter_module, "lasts_at_fixed_links", record)
+    spy = Mock(side_effect=lambda *given: np.zeros(len(given[4]), bool))
+    monkeypatch.setattr(fitter_module, "lasts_at_fixed_links", spy)
     target, robot, view = robot_over_the_floor()
-    assert not calls
+    assert not spy.called
     target.step([view], robot)
-    assert len(calls) == 1
-    assert calls[0].any()
+    spy.assert_called_once()
+    assert spy.call_args.args[2][0].any()
 
 
 def robot_over_the_floor() -> tuple[SceneFitter, RobotPosture, RgbdFrame]:

@@ -349,8 +349,11 @@ def test_a_camera_on_the_hand_rides_with_it_and_sees_nothing_nearer_than_it_can(
 # --- the same seed, the same run ---
 
 
-def test_the_same_seed_records_the_same_bytes(model: RobotModel, tmp_path: Path) -> None:
+def test_the_same_seed_records_the_same_bytes(
+    model: RobotModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also where two imagers give depth."""
+    monkeypatch.setattr("tools.hunt.recording.NUM_FRAMES", 4)
     contents = []
     assert draw(211, 1, model).world.body.depth is not None
     for name in ("a", "b"):

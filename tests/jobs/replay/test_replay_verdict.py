@@ -114,11 +114,11 @@ def test_an_object_that_may_be_a_part_of_the_arm_does_not_fail_a_driven_motion(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_contact(stage)
-    scene = stage.scene()
-    assert stage.judged(scene=scene, mode="closed-loop")[0] == 1
+    scene, brief = stage.scene(), ("--set", "control.max_time=0.5")
+    assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 1
     found = ("fore", "moves too little (3 of 5 configurations)")
     monkeypatch.setattr("splatctrl_cli.jobs.replay.verdict.unlearned_link", lambda judged: found)
-    assert stage.judged(scene=scene, mode="closed-loop")[0] == 5
+    assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 5
     code, verdict = stage.judged(scene=scene)
     assert (code, verdict["label"]) == (1, "contact"), "of the logged motion only its own link's distance is in doubt"
 

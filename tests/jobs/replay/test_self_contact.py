@@ -239,10 +239,10 @@ def measured(model: RobotModel, urdf: Path, packages: Path) -> MeasuredRobot:
 
 
 def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONFIG) -> ReplayTrace:
-    """From where the README's closed loop starts to where its log ends."""
+    """From where the log is 3 s before its end to where it ends."""
     motion, frame = tabletop.arm_motion(7.0), model.frame_names[-1]
     goal = model.frame_pose(motion.at(7.0)[0], frame)
-    task = ReplayTask(start=motion.at(1.6)[0], T_world_goal=goal, frame=frame)
+    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=goal, frame=frame)
     return closed_loop(model, config, task, lambda _: field)
 
 
