@@ -62,6 +62,15 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated second of the tabletop in the smallest images that show it."""
+    folder = tmp_path_factory.mktemp("recording") / "tiny"
+    size = ["--duration", "1.2", "--width", "64", "--height", "48", "-q"]
+    assert main(["simulate", "-o", str(folder), *size]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
 def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cloud of 600 splats, as a file."""
     path = tmp_path_factory.mktemp("splats") / "splats.ply"

@@ -12,7 +12,6 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake import request as bake_request
 from splatctrl_cli.jobs.query import query
 from splatctrl_cli.jobs.running import device
@@ -22,7 +21,7 @@ from splatctrl_cli.kernels.cuda.driver import Card
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Memory
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.cli.test_reconstruct import contents, write_folder
-from tests.field.scenes import cloud, queries, splat_set
+from tests.field.scenes import queries
 from tests.jobs.stage import failing
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.test_driver import FakeDriver
@@ -260,14 +259,6 @@ except Exception as error:
 
 BAKE = ("--box=-0.2,-0.15,-0.1,0.15,0.2,0.14", "--voxel", "0.02", "--formats", "npz", "--no-report")
 NAME = "cuda:0 (Card, driver 580.1)"
-
-
-@pytest.fixture(scope="module")
-def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("splats") / "splats.ply"
-    centers, radii = cloud(300)
-    write_ply(path, splat_set(centers, np.maximum(radii, 0.002)), {})
-    return path
 
 
 @pytest.fixture(scope="module")
