@@ -56,7 +56,8 @@ def test_a_sweep_twice_runs_nothing_and_writes_the_same_bytes(tmp_path: Path) ->
     swept(run, "margin=0.02:0.1")
     file = tmp_path / "sweep" / "sweep.json"
     before, runs = file.read_bytes(), told(run)
-    assert (file.read_bytes(), told(run), swept(run, "margin=0.02:0.1").num_new) == (before, runs, 0)
+    again = swept(run, "margin=0.02:0.1")
+    assert (file.read_bytes(), told(run), again.num_new) == (before, runs, 0)
     swept(run, "margin=0.02:0.1", out="other", workers=2)
     assert (tmp_path / "other" / "sweep.json").read_bytes() == before
 
