@@ -8,11 +8,11 @@ import pytest
 import yaml
 from junitparser import JUnitXml
 
-from tests.cli.conftest import short_sample
+from tests.cli.conftest import few_points, short_sample
 from tests.cli.here import splatctrl
 from tests.quick import unpainted
 
-__all__ = ["short_sample", "unpainted"]
+__all__ = ["few_points", "short_sample", "unpainted"]
 ROOT = Path(__file__).parent.parent
 CI = ROOT / "docs" / "ci"
 

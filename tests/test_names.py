@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 
 from tests.conftest import ROOT
 
@@ -18,12 +19,15 @@ SENTENCE_END = re.compile(r"[.;:] ")
 CODE, IN_BRACKETS = re.compile(r"``[^`]*``|`[^`]*`"), re.compile(r"\([^()]*\)|\[[^\[\]]*\]")
 
 
-def definitions() -> Iterator[tuple[str, Definition]]:
+@cache
+def definitions() -> list[tuple[str, Definition]]:
     """Place and node of every function, method and class of the package."""
-    for path in sorted((ROOT / "splatctrl_cli").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, Definition):
-                yield f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}", node
+    return [
+        (f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}", node)
+        for path in sorted((ROOT / "splatctrl_cli").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, Definition)
+    ]
 
 
 def first_lines() -> Iterator[tuple[str, str]]:

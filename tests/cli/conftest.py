@@ -21,7 +21,7 @@ from tests.recording.log.make_log import messages_of, write_raw
 __all__ = ["painted", "parsed_once", "unpainted"]
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def few_points() -> Iterator[None]:
     """Compare fewer images and points of views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
     few = {"VIEWS_PAIRS": 10, "VIEWS_POINTS": 400, "VIEWS_LANDED": 200, "EXPOSURE_FRAMES": 3}
