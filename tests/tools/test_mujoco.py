@@ -238,7 +238,7 @@ def test_a_log_of_each_format_is_read_by_the_tool(
 def test_a_recording_is_whole_and_the_same_twice(
     renderer: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(recording, "RATE", 1.0)
+    monkeypatch.setattr(recording, "RATE", 0.5)
     monkeypatch.setattr(recording, "JOINT_RATE", 20.0)
     monkeypatch.setattr(recording, "TF_RATE", 10.0)
     digests = []
