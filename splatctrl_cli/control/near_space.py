@@ -45,17 +45,18 @@ class Account:
 
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
-    unseen_to_surface [m]: least distance of a never-seen point to the map's surfaces, at unseen_place;
-    blind_to_surface [m]: likewise, about spheres with almost only such points (`NEAR_BLIND`). Infinite and NaN
-    without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages; ahead [s]: to the latest view. NaN without views.
+    unseen_path [m]: least length of a path from the map's surfaces by a never-seen point, unseen_path_place, to the
+    arm; blind_to_surface [m]: least distance of such a point to the surfaces, about spheres with almost only such
+    points (`NEAR_BLIND`). Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages;
+    ahead [s]: to the latest view. NaN without views.
     """
 
     shares: Float64
     assumed: float
     nearest: Float64
     places: Float64
-    unseen_to_surface: float
-    unseen_place: Float64
+    unseen_path: float
+    unseen_path_place: Float64
     blind_to_surface: float
     blind_place: Float64
     age: float
@@ -124,7 +125,7 @@ class NearSpace:
         is_never = is_within & np.isin(classes, NEVER_SEEN)
         num, num_never = (np.bincount(spheres[which], minlength=len(centers)) for which in (is_within, is_never))
         is_blind = (num_never >= fixed.NEAR_BLIND * num) & (num >= fixed.NEAR_FEWEST)
-        to_unseen, unseen_place = _nearest_of(points[is_never], away[is_never])
+        unseen_path, unseen_path_place = _nearest_of(points[is_never], away[is_never] + gaps[is_never])
         is_in_blind = is_never & is_blind[spheres]
         to_blind, blind_place = _nearest_of(points[is_in_blind], away[is_in_blind])
         return Account(
@@ -132,8 +133,8 @@ class NearSpace:
             assumed=float(np.mean(classes != EvidenceClass.FREE)) if len(points) else 0.0,
             nearest=nearest,
             places=places,
-            unseen_to_surface=to_unseen,
-            unseen_place=unseen_place,
+            unseen_path=unseen_path,
+            unseen_path_place=unseen_path_place,
             blind_to_surface=to_blind,
             blind_place=blind_place,
             age=float(np.quantile(ages[is_seen], fixed.NEAR_FRESH_SHARE)) if is_seen.any() else np.nan,

@@ -106,13 +106,19 @@ def lasts_at_fixed_links(
     return np.asarray(is_kept)
 
 
-def hidden_objects(buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig) -> Index:
-    """Slots (K,) of objects within `ROBOT_REACH` of the robot or base that no pixel shows.
+def hidden_objects(
+    buffer: SplatBuffer,
+    robot: RobotPosture | None,
+    seen: Seen,
+    config: OccupancyConfig,
+    reach: float = fixed.ROBOT_REACH,
+) -> Index:
+    """Slots (K,) of objects within `reach` [m] of the robot or base that no pixel shows.
 
     Fitting would pull them out of their object.
     """
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[robot.is_within(buffer.centers[slots], fixed.ROBOT_REACH)]
+    slots = slots[robot.is_within(buffer.centers[slots], reach)]
     return np.asarray(slots[shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT], np.intp)

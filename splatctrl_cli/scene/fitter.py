@@ -271,8 +271,18 @@ class SceneFitter:
         buffer = self.buffer
         removed["robot"] += buffer.kill(self._relabel(robot, seen))
         removed["seen_through"] += buffer.kill(self._floating(views))
+        removed["uncertain"] += buffer.kill(self._strayed(robot, seen))
         removed["workspace"] += buffer.kill(buffer.is_mapped & ~self.workspace.contains(buffer.centers))
         removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
+
+    def _strayed(self, robot: RobotPosture | None, seen: Seen) -> Bool:
+        """Object splats (M,) away from the robot that no pixel shows, in space that was never seen."""
+        is_strayed = np.zeros(len(self.buffer.centers), bool)
+        hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config, np.inf)
+        hidden = hidden[~self.occupancy.occupancy_around(self.buffer.centers[hidden])[1]]
+        if robot is not None:
+            is_strayed[hidden] = ~robot.is_within(self.buffer.centers[hidden], fixed.ROBOT_REACH)
+        return is_strayed
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
         reasons = removals(
@@ -399,20 +409,24 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
-        """Put object splats near the robot on measured depth, and shrink those that stand out.
+        """Put object splats on measured depth, and shrink those that protrude before it.
 
-        They shrink to no less than half of `contact_radius`; hidden splats get at most that at once.
+        Near the robot the limit is the depth's error, elsewhere `FAR_PROTRUSION` while slots are left for the gaps.
+        They shrink to no less than half of `contact_radius`; hidden splats near the robot get at most that at once.
         """
         if robot is None:
             return
         config, least = self.occupancy.config, 0.5 * self.config.contact_radius
         slots = np.flatnonzero(self._standing_for(Label.OBJECT))
-        slots = slots[robot.is_within(self.buffer.centers[slots], fixed.ROBOT_REACH)]
-        self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
+        centers = self.buffer.centers[slots] = move_to_surface(self.buffer.centers[slots], views, config.see_through)
+        is_near = robot.is_within(centers, fixed.ROBOT_REACH)
         error = max((mask.reach - config.self_mask_tolerance for _, mask in seen if mask.reach), default=0.0)
-        radii = shrink_radii(
-            self.buffer.centers[slots], self.buffer.radii[slots], views, error, least, self.num_threads
-        )
+        limits = [(is_near, error)]
+        if np.mean(~self.buffer.is_alive) > fixed.FAR_IDLE:
+            limits.append((~is_near, max(error, fixed.FAR_PROTRUSION)))
+        radii = self.buffer.radii[slots]
+        for each, limit in limits:
+            radii[each] = shrink_radii(centers[each], radii[each], views, limit, least, self.num_threads)
         is_hidden = np.isin(slots, hidden_objects(self.buffer, robot, seen, config))
         self.buffer.set_radius(slots, np.where(is_hidden, np.minimum(radii, np.float32(least)), radii))
 

@@ -184,14 +184,15 @@ def test_an_unseen_pocket_anywhere_within_a_wide_margin_is_found(away: float) ->
     place = off_the_tip(arm, away)
     seen = seen_by(lambda points: np.where(np.linalg.norm(points - place, axis=1) < 0.02, hidden, free))
     found = NearSpace(arm, 0.1).look(0, LATER, seen, lambda points: np.full(len(points), 0.01))
-    assert found.unseen_to_surface == 0.01 and np.linalg.norm(found.unseen_place - place) < 0.02
+    assert found.unseen_path == pytest.approx(0.01 + away, abs=0.02)
+    assert np.linalg.norm(found.unseen_path_place - place) < 0.02
 
 
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.05, 0.4])
-def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float) -> None:
+def test_the_least_path_over_unseen_space_is_as_long_as_by_the_reference(height: float) -> None:
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, above(height), lambda points: height - points[:, 2] + 1e-9)
-    never = [height - point[2] for point, *_ in near_points(0.03) if point[2] <= height]
-    assert found.unseen_to_surface == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
+    never = [height - point[2] + gap for point, gap, *_ in near_points(0.03) if point[2] <= height]
+    assert found.unseen_path == (pytest.approx(min(never), abs=1e-8) if never else np.inf)
     assert bool(never) == (height > -0.3)
 
 
@@ -199,8 +200,7 @@ def test_unseen_space_is_as_near_to_a_surface_as_by_the_reference(height: float)
 def test_a_sphere_that_comes_to_the_unseen_alone_has_a_distance_of_its_own(height: float, is_blind: bool) -> None:
     """Under the sheet: of 4 cm spheres most of the space about them, or all."""
     found = NearSpace(PlanarArm(), 0.03).look(0, LATER, above(height), lambda points: height - points[:, 2] + 1e-9)
-    assert np.isfinite(found.unseen_to_surface)
-    assert found.blind_to_surface == (found.unseen_to_surface if is_blind else np.inf)
+    assert np.isfinite(found.unseen_path) and np.isfinite(found.blind_to_surface) == is_blind
     assert not is_blind or found.blind_to_surface == pytest.approx(height - found.blind_place[2], abs=1e-8)
 
 
@@ -209,4 +209,4 @@ def test_what_lies_within_a_surface_of_the_map_is_surface_and_a_map_without_an_a
     found = space.look(0, LATER, seen, lambda points: points[:, 2])
     assert found.shares[EvidenceClass.HIDDEN_BY_ARM] == 0.0 and found.shares[EvidenceClass.SURFACE] > 0.3
     nowhere = space.look(SECOND, LATER, seen, lambda points: np.full(len(points), np.nan))
-    assert found.unseen_to_surface == nowhere.unseen_to_surface == np.inf
+    assert found.unseen_path == nowhere.unseen_path == np.inf

@@ -159,10 +159,8 @@ def test_a_splat_of_the_robot_that_depth_shows_to_be_the_floor_is_small_at_once(
     assert len(radii) > 3 and np.allclose(radii, 0.5 * CONFIG.contact_radius)
 
 
-def test_splats_that_the_descent_moves_near_the_robot_go_back_onto_the_surface(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The descent lifts some into the air and moves one behind the robot."""
+def test_splats_that_the_descent_lifts_go_back_onto_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The descent lifts some into the air, near the robot and far from it, and moves one behind the robot."""
     target, robot, view = robot_over_the_floor()
     buffer, moved = target.buffer, []
 
@@ -175,9 +173,36 @@ def test_splats_that_the_descent_moves_near_the_robot_go_back_onto_the_surface(
     target.step([view], robot)
     assert np.hypot(*buffer.centers[moved[0], :2]) > 0.2
     centers = buffer.centers[moved][buffer.is_alive[moved]]
-    is_near = robot.distance(centers) < ROBOT_REACH - 0.02
-    assert is_near.any() and np.abs(centers[is_near, 2]).max() < 1e-4
-    assert np.median(centers[robot.distance(centers) > ROBOT_REACH, 2]) == np.float32(0.01)
+    assert np.unique(robot.distance(centers) < ROBOT_REACH).tolist() == [False, True]
+    assert np.abs(centers[:, 2]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("place", "is_removed"),
+    [
+        pytest.param((0.35, 0.3, -0.045), True, id="far away, behind the floor"),
+        pytest.param((0.35, 0.3, -0.015), False, id="far away, within a voxel of the floor"),
+        pytest.param((0.0, 0.0, -0.045), False, id="behind the floor, near the robot"),
+    ],
+)
+def test_far_splats_in_unseen_space_are_removed(place: tuple[float, float, float], is_removed: bool) -> None:
+    target, robot, view = robot_over_the_floor()
+    target.buffer.centers[np.flatnonzero(target.buffer.is_alive)[0]] = place
+    assert target.step([view], robot).removed["uncertain"] == is_removed
+    away = np.linalg.norm(target.splats().centers - np.float32(place), axis=1)
+    assert (away.min() < 0.005) == (not is_removed)
+
+
+@pytest.mark.parametrize("max_splats", [1500, 60])
+def test_far_splats_shrink_to_a_centimetre_while_slots_are_left(max_splats: int) -> None:
+    target = SceneFitter(replace(CONFIG, max_splats=max_splats), OccupancyConfig(), WORKSPACE)
+    target.step([frame()], ball(5.0))
+    alive = np.flatnonzero(target.buffer.is_alive)
+    assert (len(alive) > 0.95 * max_splats) == (max_splats < 100)
+    target.buffer.set_radius(alive, 0.02)
+    target.step([frame()], ball(5.0))
+    protrusion = target.splats().centers[:, 2] + target.splats().radii
+    assert np.median(protrusion) > 0.015 if max_splats < 100 else protrusion.max() < 0.0101
 
 
 def test_what_was_the_robots_before_is_told_to_the_running_mean_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -299,13 +299,13 @@ def known_near(**changes: float) -> Any:
     """The account of one state about which all was seen free, with `changes` to its columns."""
     near = {name: np.zeros((1, *shape)) for name, shape in NEAR_COLUMNS.items()}
     near["class_distance"] += np.inf
-    far = {name: np.array([np.inf]) for name in near if name.endswith("_to_surface")}
+    far = {name: np.array([np.inf]) for name in near if name in ("unseen_path", "blind_to_surface")}
     return near | far | {name: np.array([value]) for name, value in changes.items()}
 
 
 def test_a_run_names_the_one_limit_without_which_it_is_safe() -> None:
     lacking = Reason(outcome=Outcome.NOT_EVALUABLE, sentence="")
-    unseen, both = known_near(unseen=0.9), known_near(unseen=0.9, unseen_to_surface=0.01)
+    unseen, both = known_near(unseen=0.9), known_near(unseen=0.9, unseen_path=0.01)
     assert word_of(verdict_of("replay", [lacking]), unseen, 0.02).only == "unseen"
     assert word_of(verdict_of("replay", [lacking, lacking]), unseen, 0.02).only == ""
     assert word_of(verdict_of("replay", [lacking, lacking]), both, 0.02).only == ""

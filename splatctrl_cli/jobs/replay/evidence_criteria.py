@@ -11,11 +11,11 @@ from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config.fixed import (
     BEYOND,
     COARSE_VOXEL,
-    HIDDEN,
     MISPLACED,
     UNSEEN,
     UNSEEN_BY_ONE,
     UNSEEN_BY_TWO,
+    UNSEEN_PATH,
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
@@ -87,12 +87,12 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Limit(
-        asked="never seen, from a surface of the map",
+        asked="path from a surface of the map to the arm, by a point never seen",
         why="an object may extend into space on its unseen side",
-        column="unseen_to_surface",
-        least=HIDDEN,
-        words="unseen space within the margin of the arm is {} from a surface of the map, allowed {allowed}: the "
-        "surface may extend there",
+        column="unseen_path",
+        least=UNSEEN_PATH,
+        words="a surface of the map is {} from the arm by a path over unseen space, allowed {allowed}: it may extend "
+        "there",
         remedy="add a camera that sees that side",
     ),
     Limit(

@@ -165,7 +165,7 @@ OF_STATES: Declared = (
     _of("clearance_splats", "min_clearance_splats", LEAST, GAP, shown=NEAREST),
     _of("unseen", "max_unseen_share", LARGEST, BAD_SHARE),
     _of("assumed", "max_assumed_share", LARGEST, BAD_SHARE),
-    _of("unseen_to_surface", "min_unseen_to_surface", LEAST, GAP, count=num_states),
+    _of("unseen_path", "min_unseen_path", LEAST, GAP, count=num_states),
     _of("blind_to_surface", "min_blind_to_surface", LEAST, GAP, count=num_states),
     *(
         figure

@@ -45,7 +45,7 @@ from splatctrl_cli.voxels import EvidenceClass
 KINDS = len(EvidenceClass)
 NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the arm, with their shapes at a state
     **dict.fromkeys(("evidence_age", "evidence_ahead", "unseen", "assumed"), ()),
-    **{"unseen_to_surface": (), "unseen_to_surface_place": (3,)},
+    **{"unseen_path": (), "unseen_path_place": (3,)},
     **{"blind_to_surface": (), "blind_to_surface_place": (3,)},
     **{"class_shares": (KINDS,), "class_distance": (KINDS,), "class_places": (KINDS * 3,)},
 }
@@ -315,15 +315,15 @@ def _fold_accounts(accounts: Sequence[Account]) -> dict[str, float | Float64]:
     """
     shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])
-    unseen, blind = (min(accounts, key=attrgetter(f"{name}_to_surface")) for name in ("unseen", "blind"))
+    unseen, blind = (min(accounts, key=attrgetter(name)) for name in ("unseen_path", "blind_to_surface"))
     return {
         "class_shares": shares[0],
         "class_distance": nearest.min(axis=0),
         "class_places": places[least, np.arange(KINDS)].ravel(),
         "unseen": float(shares[:, NEVER_SEEN].sum(axis=1).max()),
         "assumed": max(each.assumed for each in accounts),
-        "unseen_to_surface": unseen.unseen_to_surface,
-        "unseen_to_surface_place": unseen.unseen_place,
+        "unseen_path": unseen.unseen_path,
+        "unseen_path_place": unseen.unseen_path_place,
         "blind_to_surface": blind.blind_to_surface,
         "blind_to_surface_place": blind.blind_place,
     }

@@ -246,16 +246,16 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
 def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
     near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    return {f"{column}_to_surface": near} | {f"{column}_to_surface_place": np.full((NUM, 3), 0.25)}
+    return {column: near, f"{column}_place": np.full((NUM, 3), 0.25)}
 
 
 @pytest.mark.parametrize(
     ("near", "distance", "count"),
     [
-        (partial(from_a_surface, "unseen"), 0.031, 0),
-        (partial(from_a_surface, "unseen"), 0.029, 1),
-        (partial(from_a_surface, "blind"), 0.101, 0),
-        (partial(from_a_surface, "blind"), 0.099, 1),
+        (partial(from_a_surface, "unseen_path"), 0.043, 0),
+        (partial(from_a_surface, "unseen_path"), 0.041, 1),
+        (partial(from_a_surface, "blind_to_surface"), 0.101, 0),
+        (partial(from_a_surface, "blind_to_surface"), 0.099, 1),
         *((partial(near_a, kind), distance, int(distance < 0.02)) for kind in STRICT for distance in (0.021, 0.019)),
         *((partial(near_a, kind), 0.0, 0) for kind in EVIDENCE if kind not in STRICT),
     ],
