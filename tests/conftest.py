@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,14 @@ def sample_data() -> Path:
 def plain_arm() -> Path:
     """A folder whose tabletop/ holds the simulated arm, of primitive shapes, and spheres that cover it closely."""
     return ROOT / "tests" / "data"
+
+
+@pytest.fixture(scope="session")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture, scene, field and replay that version 0.1.0 wrote; not to be written to."""
+    folder = tmp_path_factory.mktemp("older")
+    shutil.unpack_archive(ROOT / "tests" / "data" / "older.zip", folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

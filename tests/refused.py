@@ -12,7 +12,7 @@ def expect_refusal(
     words: str,
     call: Callable[..., object],
     *given: object,
-    error: type[SplatCtrlError] = InputError,
+    error: type[SplatCtrlError] | tuple[type[SplatCtrlError], ...] = InputError,
     has_remedy: bool = False,
     **named: object,
 ) -> str:

@@ -9,10 +9,10 @@ import pytest
 
 import splatctrl_cli
 from splatctrl_cli import api
-from tests.cli.conftest import short_sample
+from tests.cli.conftest import few_points, short_sample
 from tests.quick import unpainted
 
-__all__ = ["short_sample", "unpainted"]
+__all__ = ["few_points", "short_sample", "unpainted"]
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "api.md"

@@ -5,23 +5,12 @@
 
 import csv
 import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.cli.here import splatctrl
-
-OLDER = Path(__file__).parent / "data" / "older.zip"
-
-
-@pytest.fixture(scope="module")
-def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("older")
-    with zipfile.ZipFile(OLDER) as archive:
-        archive.extractall(folder)
-    return folder
 
 
 @pytest.mark.parametrize(

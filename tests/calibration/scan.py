@@ -93,8 +93,7 @@ def printed(board: Board, *, has_markers: bool = False) -> UInt8:
         charuco = cv2.aruco.CharucoBoard((columns, rows), board.square, 0.8 * board.square, dictionary)
         inside = charuco.generateImage((columns * EDGE, rows * EDGE))
     else:
-        is_white = np.indices((rows, columns)).sum(axis=0) % 2 == 1
-        inside = np.kron(is_white, np.ones((EDGE, EDGE))) * 255
+        inside = np.kron(np.indices((rows, columns)).sum(axis=0) % 2 == 1, np.ones((EDGE, EDGE))) * 255
     return np.pad(inside.astype(np.uint8), EDGE, constant_values=255)
 
 

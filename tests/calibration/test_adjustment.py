@@ -65,8 +65,7 @@ def test_what_passes_a_still_camera_is_left_out_of_what_it_sees() -> None:
     frames = [frame_of(np.full((48, 64), 1.0), stamp_ns=i) for i in range(9)]
     for i in range(3):
         frames[i].depth[10:20, 10:20] = 0.4
-    still = still_frame(frames)
-    np.testing.assert_allclose(still.depth, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(still_frame(frames).depth, 1.0, rtol=1e-6)
 
 
 def test_a_strided_frame_shows_the_same_points() -> None:

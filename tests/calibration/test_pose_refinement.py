@@ -157,8 +157,7 @@ def test_gains_are_found_to_a_percent_and_none_where_none_is_needed(views: list[
 
 def test_one_view_is_brought_to_the_others_that_stay(views: list[RgbdFrame]) -> None:
     gain = np.array([1.2, 1.0, 0.9])
-    free = np.arange(len(views)) == 0
-    found = exposure_gains([exposed(views[0], 1 / gain), *views[1:]], 1.0, free)
+    found = exposure_gains([exposed(views[0], 1 / gain), *views[1:]], 1.0, np.arange(len(views)) == 0)
     assert found[0] == pytest.approx(gain, rel=0.01)
     assert found[1:] == pytest.approx(1.0)
 

@@ -102,8 +102,7 @@ def box_x(frame: RgbdFrame, near: float) -> tuple[float, float]:
     """Least and largest x [m] of what the middle row shows nearest to the wall's left or right box."""
     row, k = frame.depth[HEIGHT // 2], frame.intrinsics
     columns = np.flatnonzero(np.abs(row - near) < 0.02)
-    edges = np.concatenate([columns[:1] - 0.5, columns[-1:] + 0.5])
-    low, high = (edges - k.cx) / k.fx * near
+    low, high = (np.concatenate([columns[:1] - 0.5, columns[-1:] + 0.5]) - k.cx) / k.fx * near
     return float(low), float(high)
 
 
@@ -119,8 +118,7 @@ def at(left: float, right: float, near: float, within: float) -> Callable[[Path,
     """The box's borders [m] are where they should be: a pixel's width may be missing."""
 
     def examine(folder: Path, out: Path, run: Run) -> None:
-        frame = ingested(folder, out, run)
-        low, high = box_x(frame, near)
+        low, high = box_x(ingested(folder, out, run), near)
         assert abs(low - left) < within and abs(high - right) < within, (low, high)
 
     return examine
@@ -132,8 +130,7 @@ def both_at_the_box(folder: Path, out: Path, run: Run) -> None:
     is_near = np.abs(frame.depth[HEIGHT // 2] - 0.9) < 0.02
     is_bright = frame.color[HEIGHT // 2, :, 0] > 170
     assert is_near[:20].any() and np.count_nonzero(is_near[:20] != is_bright[:20]) <= 2
-    columns = np.flatnonzero(is_near[:20])
-    assert -0.52 < (columns[0] - 31.5) / 45 * 0.9 < -0.46
+    assert -0.52 < (np.flatnonzero(is_near[:20])[0] - 31.5) / 45 * 0.9 < -0.46
 
 
 def one_or_the_other(folder: Path, out: Path, run: Run) -> None:

@@ -4,9 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
-
-from splatctrl_cli.cli.main import main
+from tests.cli.here import splatctrl
 
 
 @dataclass(frozen=True)
@@ -40,16 +38,10 @@ class Case:
     has_shared: bool = False
 
 
-def runner(capsys: pytest.CaptureFixture[str]) -> Run:
-    """What calls the command line in this process and gives its code and output."""
-
-    def run(words: Sequence[str | Path]) -> Result:
-        capsys.readouterr()
-        code = main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return Result(code=code, out=out, err=err)
-
-    return run
+def run(words: Sequence[str | Path]) -> Result:
+    """Call the command line in this process."""
+    done = splatctrl(*words)
+    return Result(code=done.returncode, out=done.stdout, err=done.stderr)
 
 
 def expect_result(run: Run, words: Sequence[str | Path], *parts: str, code: int = 0) -> Result:

@@ -196,8 +196,7 @@ CONSTANTS = {"ten-metres": 10.0, "four-metres": 4.0, "counts-65534": 65534}
 
 def _make_codes(folder: Path) -> None:
     for name, value in {**CODES, **CONSTANTS}.items():
-        is_counts = isinstance(value, int)
-        encoding, dtype = ("16UC1", "<u2") if is_counts else ("32FC1", "<f4")
+        encoding, dtype = ("16UC1", "<u2") if isinstance(value, int) else ("32FC1", "<f4")
 
         def change(message: Any, value: float = value, dtype: str = dtype) -> Any:
             pixels = np.frombuffer(message.data.tobytes(), dtype).reshape(message.height, message.width).copy()

@@ -111,10 +111,6 @@ def _examine_axes(folder: Path, out: Path, run: Run) -> None:
         expect_result(run, ["robot", "info", "--urdf", folder / f"{name}.urdf"], sentence, code=4 if sentence else 0)
 
 
-def _dae(folder: Path) -> None:
-    written(folder, {"07-cm-dae.urdf": urdf_of("cm.dae")}, {"cm.dae": dae('<unit name="u" meter="0.01"/>')})
-
-
 def _examine_dae(folder: Path, out: Path, run: Run) -> None:
     assert areas(run, folder / "07-cm-dae.urdf", out) == {"base": 600.0, "l1": 2200.0}
 
@@ -214,7 +210,14 @@ SMALL = {"center": [0, 0, 0], "radius": 0.01}
 CASES: tuple[Case, ...] = (
     Case(name="11-urdf-zero-axis", make=_zero_axis, examine=_examine_zero_axis, has_shared=True),
     Case(name="urdf-axes-of-other-kinds", make=_axes, examine=_examine_axes),
-    Case(name="15-dae-unit", make=_dae, examine=_examine_dae, has_shared=True),
+    Case(
+        name="15-dae-unit",
+        make=lambda folder: written(
+            folder, {"07-cm-dae.urdf": urdf_of("cm.dae")}, {"cm.dae": dae('<unit name="u" meter="0.01"/>')}
+        ),
+        examine=_examine_dae,
+        has_shared=True,
+    ),
     Case(name="meshes-of-other-units-and-tails", make=_other_meshes, examine=_examine_other_meshes),
     Case(name="sphere-files-of-other-tools", make=_sphere_files, examine=_examine_sphere_files),
 )

@@ -77,10 +77,6 @@ def face_bytes(order: str) -> tuple[str, bytes, bytes]:
     return TRIANGLES[0], TRIANGLES[1], bytes_
 
 
-def _double(folder: Path) -> None:
-    write_ply(folder / "10-double-utm.ply", plane_rows(UTM))
-
-
 def _examine_double(folder: Path, out: Path, run: Run) -> None:
     source = folder / "10-double-utm.ply"
     moves = "has steps of 0.5 m there and would move them by 0.2"
@@ -114,10 +110,6 @@ def _examine_siblings_of_double(folder: Path, out: Path, run: Run) -> None:
     neither(run, folder / "float.ply", out, rounded)
     for name in ("text.ply", "text_float.ply", "big.ply"):
         assert exported(run, folder / name, out / name)["origin"] == "500000 5400000 300"
-
-
-def _linear(folder: Path) -> None:
-    write_ply(folder / "11-linear-scale.ply", plane_rows(scale_0=0.02, scale_1=0.02, scale_2=0.02))
 
 
 LINEAR = "expected log(sigma [m]), got 0.02 to 0.02: splats of 1.02 m, 0.05"
@@ -230,10 +222,6 @@ def spz_4(
     return head.ljust(place, b"\0") + table + b"".join(packed)
 
 
-def _spz(folder: Path) -> None:
-    (folder / "06-v4.spz").write_bytes(spz_4(spz_parts()))
-
-
 def _examine_spz(folder: Path, out: Path, run: Run) -> None:
     assert exported(run, folder / "06-v4.spz", out / "a.ply")["num_splats"] == SIDE * SIDE
     centers = read_positions(out / "a.ply")
@@ -293,11 +281,28 @@ def _examine_other_spz(folder: Path, out: Path, run: Run) -> None:
 
 
 CASES: tuple[Case, ...] = (
-    Case(name="08-ply-double-utm", make=_double, examine=_examine_double, has_shared=True),
+    Case(
+        name="08-ply-double-utm",
+        make=lambda folder: write_ply(folder / "10-double-utm.ply", plane_rows(UTM)),
+        examine=_examine_double,
+        has_shared=True,
+    ),
     Case(name="ply-double-and-float-coordinates", make=_siblings_of_double, examine=_examine_siblings_of_double),
-    Case(name="33-ply-linear-scales", make=_linear, examine=_examine_linear, has_shared=True),
+    Case(
+        name="33-ply-linear-scales",
+        make=lambda folder: write_ply(
+            folder / "11-linear-scale.ply", plane_rows(scale_0=0.02, scale_1=0.02, scale_2=0.02)
+        ),
+        examine=_examine_linear,
+        has_shared=True,
+    ),
     Case(name="ply-scales-of-other-kinds", make=_siblings_of_linear, examine=_examine_siblings_of_linear),
-    Case(name="18-spz-v4", make=_spz, examine=_examine_spz, has_shared=True),
+    Case(
+        name="18-spz-v4",
+        make=lambda folder: (folder / "06-v4.spz").write_bytes(spz_4(spz_parts())),
+        examine=_examine_spz,
+        has_shared=True,
+    ),
     Case(name="spz-of-other-versions", make=_other_spz, examine=_examine_other_spz),
     Case(name="19-ply-empty-face-element", make=_empty_faces, examine=_examine_empty_faces, has_shared=True),
     Case(name="ply-faces-before-and-after", make=_faces, examine=_examine_faces),

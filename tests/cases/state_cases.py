@@ -118,7 +118,6 @@ def both_fingers(folder: Path, out: Path, run: Run) -> None:
     model, states, _ = read(folder)
     leader, follower = (model.joint_names.index(f"{side}finger_joint") for side in ("", "right_"))
     mimic = next(joint.mimic for joint in model.urdf.joints if joint.name == "right_finger_joint")
-    assert mimic is not None
     q, v = states.position[: len(states)], states.velocity[: len(states)]
     assert np.ptp(q[:, leader]) > 0.1
     np.testing.assert_allclose(q[:, follower], mimic[1] * q[:, leader] + mimic[2], atol=1e-12)
@@ -129,8 +128,7 @@ def both_fingers(folder: Path, out: Path, run: Run) -> None:
 def runs_on(folder: Path, out: Path, run: Run) -> None:
     """A joint that turns at 0.5 rad/s is not faster where its position is counted from the other end."""
     _, states, notes = read(folder, name="*wrap*.mcap")
-    position = states.position[: len(states)][:, 0]
-    assert np.abs(np.diff(position)).max() < 0.05
+    assert np.abs(np.diff(states.position[: len(states)][:, 0])).max() < 0.05
     assert np.abs(states.velocity[: len(states)][:, 0]).max() < 0.6
     assert any("whole turn" in note for note in notes)
     checked(folder, run, "whole turn")

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
@@ -18,6 +17,7 @@ from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.source import open_logs
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
+from tests.cli.conftest import few_points
 from tests.recording.log.make_log import (
     FRAME_NS,
     START_NS,
@@ -32,6 +32,7 @@ from tests.recording.log.make_log import (
 )
 from tests.refused import expect_refusal
 
+__all__ = ["few_points"]
 ROOT = Path(__file__).parents[2]
 COLOR, DEPTH, INFO = "/cam0/color/image_raw/compressed", "/cam0/depth/image_raw", "/cam0/color/camera_info"
 NO_DEPTH = "record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
@@ -41,14 +42,6 @@ CAMERAS_2, CAMERAS_3 = (replace(GOOD, cameras=tuple(f"cam{i}" for i in range(num
 SECOND = 1_000_000_000
 NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 Edit = Callable[[Any], object]
-
-
-@pytest.fixture(autouse=True)
-def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare fewer points between views, which are not broken here."""
-    monkeypatch.setattr(limits, "VIEWS_PAIRS", 6)
-    monkeypatch.setattr(limits, "VIEWS_POINTS", 200)
-    monkeypatch.setattr(limits, "VIEWS_LANDED", 100)
 
 
 def checked(path: Path, **options: Any) -> CheckReport:
@@ -279,8 +272,7 @@ def test_every_code_that_is_made_is_in_the_table_and_every_entry_is_made() -> No
     sources = [*(ROOT / "splatctrl_cli/checks").glob("check_*.py"), ROOT / "splatctrl_cli/jobs/check.py"]
     text = "\n".join(path.read_text() for path in sources)
     made = set(re.findall(r'(?:error|warning|note|severity|make)\(\s*"([a-z-]+)"', text))
-    judged = set(re.findall(r'judge\([^"]*"([a-z-]+)"', text))
-    assert made | judged <= set(CHECKS)
+    assert made | set(re.findall(r'judge\([^"]*"([a-z-]+)"', text)) <= set(CHECKS)
     assert set(CHECKS) <= set(re.findall(r'"([a-z-]+)"', text))
 
 

@@ -21,13 +21,13 @@ from tests.recording.log.make_log import messages_of, write_raw
 __all__ = ["painted", "parsed_once", "unpainted"]
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def few_points() -> Iterator[None]:
-    """Compare fewer points between views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
+    """Compare fewer images and points of views, a fifth of a small fit; look around the arm every 3 cm, not 1."""
+    few = {"VIEWS_PAIRS": 10, "VIEWS_POINTS": 400, "VIEWS_LANDED": 200, "EXPOSURE_FRAMES": 3}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limits, "VIEWS_PAIRS", 10)
-        patch.setattr(limits, "VIEWS_POINTS", 400)
-        patch.setattr(limits, "VIEWS_LANDED", 200)
+        for name, value in few.items():
+            patch.setattr(limits, name, value)
         patch.setattr(fixed, "NEAR_MOVED", 0.03)
         yield
 
@@ -58,6 +58,15 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
     size = ["--duration", "1.0", "--width", "96", "--height", "72", "--dtu"]
     assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated second of the tabletop in the smallest images that show it."""
+    folder = tmp_path_factory.mktemp("recording") / "tiny"
+    size = ["--duration", "1.2", "--width", "64", "--height", "48", "-q"]
+    assert main(["simulate", "-o", str(folder), *size]) == 0
     return folder
 
 

@@ -171,8 +171,7 @@ def test_what_a_page_reads_is_the_suite_as_it_is(
         nodes = json.loads((out / "batch.json").read_text())["nodes"]
         return {node["id"]: node["state"] for node in nodes}
 
-    before = states(SUITE, 1)
-    assert list(before) == ["damaged/info", "damaged/ingest", "good/info", "good/ingest"]
+    assert list(states(SUITE, 1)) == ["damaged/info", "damaged/ingest", "good/info", "good/ingest"]
     expected = SUITE.replace("[jobs.info]\n", "[recordings.jobs.ingest]\nexpect = 'exit 4'\n[jobs.info]\n")
     assert set(states(expected, 0).values()) == {"done"}, "the last run is judged by what is expected now"
     assert main(["batch", str(suite), "--failed", "--json"]) == 0

@@ -308,8 +308,7 @@ def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
     written(folder, arm_of(BOX, SPHERE).replace("collision>", "visual>"), "bare.urdf")
     write_ply(folder / "splats.ply", ball(), {})
     (folder / "cut.ply").write_bytes((folder / "splats.ply").read_bytes()[:-5])
-    robot = ball(3)
-    write_ply(folder / "robot.ply", replace(robot, labels=np.full(3, Label.ROBOT, np.uint8)), {})
+    write_ply(folder / "robot.ply", replace(ball(3), labels=np.full(3, Label.ROBOT, np.uint8)), {})
     return folder
 
 

@@ -77,8 +77,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
 
 
 def test_a_closed_loop_reaches_the_logged_end_and_gates_on_it(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    end = START + np.array([0.5, 0.1, 0, 0, 0, 0, 0])
-    desk.source.states = logged(end)
+    desk.source.states = logged(START + np.array([0.5, 0.1, 0, 0, 0, 0, 0]))
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     gates = ["--require", "goal_reached>=1", "--require", "num_hold<=0", "--require", "min_barrier_clearance>=0.019"]
     assert desk.replay("--scene", str(scene), "-q", "--json", "--mode", "closed-loop", *gates) == 0

@@ -48,8 +48,7 @@ def replayed(desk: Desk, scene: str, log: Path, *more: str) -> int:
 
 
 def test_a_log_of_the_robot_alone_is_audited(desk: Desk, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
-    log = write_mcap(desk.folder / "x.mcap", states_of(moving(), JOINTS))
-    assert replayed(desk, scene, log) == 0
+    assert replayed(desk, scene, write_mcap(desk.folder / "x.mcap", states_of(moving(), JOINTS))) == 0
     said = capsys.readouterr().out
     assert "log: no camera is used" in said and "log: /joint_states: no velocities recorded" in said
     found = desk.json("states.json")
@@ -200,8 +199,7 @@ def test_a_capture_is_replayed_as_its_log(tmp_path: Path, desk: Desk, kind: str)
     options = ["--mode", "open-loop", *(["--joint-topic", "/controller"] if kind == "chosen" else [])]
     steps, metrics, states = audited(log, desk, tmp_path / "of_log", *options)
     assert metrics["num_states"] == (NUM_STATES - 1 if kind == "two-topics" else NUM_STATES)
-    again = audited(capture, desk, tmp_path / "of_capture", *options)
-    assert again == (steps, metrics, states)
+    assert audited(capture, desk, tmp_path / "of_capture", *options) == (steps, metrics, states)
     assert any("interpolated" in note for note in states["loss"]["notes"]) == (kind == "two-topics")
 
 
@@ -222,11 +220,9 @@ def test_a_capture_keeps_commands_and_they_can_be_read_plainly(tmp_path: Path, a
         for state in states:
             assert state.commanded_velocity is not None
             np.testing.assert_allclose(state.commanded_velocity, 0.02 * state.position)
-    kept = np.load(capture / "joint_topics" / "0" / "commanded_velocity.npy")
-    assert kept.shape == (NUM_STATES, 7)
+    assert np.load(capture / "joint_topics" / "0" / "commanded_velocity.npy").shape == (NUM_STATES, 7)
     assert "commanded_velocity" in np.load(capture / "joints.npz").files
-    sums = (capture / "SHA256SUMS").read_text()
-    assert "  joint_topics/0/commanded_velocity.npy\n" in sums
+    assert "  joint_topics/0/commanded_velocity.npy\n" in (capture / "SHA256SUMS").read_text()
 
 
 def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
@@ -235,8 +231,7 @@ def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
     log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
     assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
     file = capture / "joint_topics" / "0" / "position.npy"
-    content = file.read_bytes()
-    file.write_bytes(content[:-8] + b"\0" * 8)
+    file.write_bytes(file.read_bytes()[:-8] + b"\0" * 8)
     scene = [*desk.robot, "--scene", str(tmp_path / "scene")]
     assert main(["replay", str(capture), *scene]) == 4
     assert "position.npy: missing, or its checksum differs" in capsys.readouterr().err

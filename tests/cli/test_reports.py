@@ -5,7 +5,6 @@ runs.
 import ast
 import json
 import shutil
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -173,20 +172,15 @@ def test_a_summary_that_cannot_be_written_is_said_and_changes_nothing(
     assert (told.returncode, "GITHUB_STEP_SUMMARY: cannot be written" in told.stderr) == (0, True)
 
 
-OLDER = Path(__file__).parents[1] / "data" / "older.zip"
-
-
 @pytest.fixture
-def audits(tmp_path: Path) -> tuple[Path, Path]:
+def audits(older: Path, tmp_path: Path) -> tuple[Path, Path]:
     """A replay, and a worse one."""
-    with zipfile.ZipFile(OLDER) as archive:
-        archive.extractall(tmp_path)
-    shutil.copytree(tmp_path / "audit", tmp_path / "worse")
+    shutil.copytree(older / "audit", tmp_path / "worse")
     run = json.loads((tmp_path / "worse" / "run.json").read_text())
     run["metrics"] |= {"min_clearance": 0.001, "min_self_clearance": 0.06, "num_states": 7}
     run["config"]["control"]["margin"] = 0.03
     (tmp_path / "worse" / "run.json").write_text(json.dumps(run))
-    return tmp_path / "audit", tmp_path / "worse"
+    return older / "audit", tmp_path / "worse"
 
 
 def test_a_regression_exits_with_1_and_is_a_failure_in_junit(audits: tuple[Path, Path], tmp_path: Path) -> None:

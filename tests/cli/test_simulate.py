@@ -43,8 +43,7 @@ def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
 
 
 def test_the_same_command_writes_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
-    result = splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
-    assert result.returncode == 0
+    assert splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q").returncode == 0
     files = [path.relative_to(recorded) for path in recorded.rglob("*") if path.is_file() and path.name != "run.json"]
     assert len(files) > 30
     for name in files:

@@ -58,8 +58,7 @@ def test_the_merged_box_is_never_empty_wherever_the_arm_is_and_however_it_moved(
         can = np.minimum(allowed[1], last + change) >= np.maximum(allowed[0], last - change)
         assert np.all(np.abs(np.where(can, lowest - last, 0.0)) <= change + 1e-12)
         assert np.all(np.abs(np.where(can, highest - last, 0.0)) <= change + 1e-12)
-        is_inside = (q > box.lower) & (q < box.upper)
-        assert np.all(np.where(is_inside, allowed[1] <= free.box(q)[1], True))
+        assert np.all(np.where((q > box.lower) & (q < box.upper), allowed[1] <= free.box(q)[1], True))
 
 
 @pytest.mark.parametrize(("acceleration", "gain"), [(0.5, 10.0), (5.0, 10.0), (2.0, 100.0)])
@@ -102,8 +101,7 @@ def test_accelerations_come_for_all_joints_or_one_by_one(tmp_path: Path) -> None
     ],
 )
 def test_an_acceleration_that_cannot_be_is_refused(value: float | tuple[float, ...], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        limits(value)  # type: ignore[arg-type]
+    expect_refusal(words, limits, value, error=UsageError)
 
 
 def test_the_fr3_limits_are_those_that_are_published() -> None:
@@ -117,8 +115,7 @@ def test_the_fr3_limits_are_those_that_are_published() -> None:
         q = lower + share * (upper - lower)
         lowest, highest = limit(q)
         assert np.all(lowest <= 0) and np.all(highest >= 0) and np.all(highest <= most)
-        ahead = limit(q + 1e-6)[1]
-        assert np.all(np.abs(ahead - highest) <= 1e-6 * slope / (2 * offset) + 1e-12)
+        assert np.all(np.abs(limit(q + 1e-6)[1] - highest) <= 1e-6 * slope / (2 * offset) + 1e-12)
 
 
 def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:

@@ -170,8 +170,7 @@ def test_a_program_and_what_it_started_are_ended(tmp_path: Path) -> None:
 
 def test_a_program_is_told_what_our_own_controller_is(tmp_path: Path) -> None:
     heard = tmp_path / "heard"
-    copy = f"open({str(heard)!r}, 'a').write(json.dumps(start) + '\\n' + line)"
-    trace, _ = driven(at_third(copy))
+    trace, _ = driven(at_third(f"open({str(heard)!r}, 'a').write(json.dumps(start) + '\\n' + line)"))
     start, question = map(json.loads, heard.read_text().splitlines())
     assert start == {
         "protocol": 1,

@@ -59,8 +59,7 @@ def by_reference(motion: ArmMotion, t: int, m: int, stopping: Stopping, scale: f
             row = rows[0] if motion.extension[t] <= 0.5 else rows[1]
             share = float(abs(dq[joint]) / LIMIT[joint])
             stopped = reference.between(share, dict(zip(row.speed, row.distance, strict=True)))
-            lever = float(np.linalg.norm(motion.jacobian[t, m, :, joint]))
-            stop += lever * stopped
+            stop += float(np.linalg.norm(motion.jacobian[t, m, :, joint])) * stopped
             late = reference.between(share, dict(zip(row.speed, row.time, strict=True)))
             time = max(time, late, row.time[0] if share > 1e-3 else 0.0)
     toward = -float(motion.gradient[t, m] @ velocity[m])

@@ -221,8 +221,7 @@ def test_the_margin_of_a_velocity_is_the_room_that_its_tightest_row_has_left() -
         assert found.barrier == pytest.approx(rooms.min(), abs=1e-7)
         assert found.barrier_row == names[int(np.argmin(rooms))]
         assert found.limit == pytest.approx(min(1.5 - velocity.max(), 1.5 + velocity.min()))
-    step = steered.step(q, goal(0.0, 0.0))
-    assert steered.margin_of(q, step.velocity).barrier >= -1e-6
+    assert steered.margin_of(q, steered.step(q, goal(0.0, 0.0)).velocity).barrier >= -1e-6
     assert steered.margin_of(q, np.array([0.0, 2.0])).limit_row == "elbow highest"
 
 

@@ -38,8 +38,7 @@ def test_half_a_surface_is_accurate_and_incomplete() -> None:
 
 
 def test_what_is_farther_than_the_maximum_counts_in_a_share_only() -> None:
-    points = np.vstack([plane(0.001), plane(0.05)])
-    score = cloud_score(points, plane(0.0), SEEN, max_distance=0.02)
+    score = cloud_score(np.vstack([plane(0.001), plane(0.05)]), plane(0.0), SEEN, max_distance=0.02)
     assert (score["accuracy"], score["accuracy_beyond"]) == (pytest.approx(0.001), 0.5)
 
 

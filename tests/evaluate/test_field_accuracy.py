@@ -27,6 +27,7 @@ from splatctrl_cli.geometry import back_project, look_at
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Intrinsics, RgbdFrame
 from tests.evaluate.test_views import wall_frame
 from tests.plain import plain_frame
+from tests.refused import expect_refusal
 from tests.robot.test_mesh_distance import box_distance
 
 TRUTH = np.array([0.01, 0.015, 0.03, 0.07, 0.15, 0.3, -0.01])
@@ -68,8 +69,7 @@ def test_bands_without_cells_have_no_figures_and_nothing_holds() -> None:
     ],
 )
 def test_arrays_that_do_not_fit_are_named(fields: dict[str, Float64], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        field_accuracy(fields, TRUTH, TRUTH > 0, median_radius=0.0)
+    expect_refusal(words, field_accuracy, fields, TRUTH, TRUTH > 0, median_radius=0.0)
 
 
 def small_grid(header: dict[str, object], **channels: float) -> DistanceGrid:
@@ -142,8 +142,7 @@ def test_cells_without_a_distance_are_blank_and_a_field_of_them_cannot_be_compar
     blank = compared(given)
     assert (blank["num_blank"], blank["num_near"], blank["num_seen"]) == (1, 7, 3)
     given["fields"]["sdf"][:] = np.nan
-    with pytest.raises(NotEvaluableError, match=r"truth\.json: no cell of the grid lies within 0\.2 m"):
-        compared(given)
+    expect_refusal(r"truth\.json: no cell of the grid lies within 0\.2 m", compared, given, error=NotEvaluableError)
 
 
 SIZE = (0.21, 0.21, 0.21)

@@ -54,9 +54,7 @@ def test_a_residual_that_is_infinite_is_not_left_out_of_the_largest(
 
 
 def changed(values: ArrayLike) -> MeanChange:
-    found = mean_change(np.asarray(values, np.float64).tolist())
-    assert found is not None
-    return found
+    return mean_change(np.asarray(values, np.float64).tolist())
 
 
 def test_fewer_than_eight_pairs_have_no_interval() -> None:

@@ -46,8 +46,7 @@ def test_the_worst_moments_are_those_of_separate_events(num: int) -> None:
 
 def test_the_flank_of_an_event_is_not_another() -> None:
     stamps = np.arange(0, 4 * SECOND, SECOND // 100)
-    falling = np.linspace(1.0, 0.1, len(stamps))
-    assert worst_moments(stamps, falling, 3) == [len(stamps) - 1]
+    assert worst_moments(stamps, np.linspace(1.0, 0.1, len(stamps)), 3) == [len(stamps) - 1]
     assert worst_moments(stamps, np.full(len(stamps), np.nan), 3) == []
 
 

@@ -10,13 +10,14 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field import weights as weights_module
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import KERNEL_OF, GpdfField, field_over
+from splatctrl_cli.field.distance import KERNEL_OF, field_over
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference import field as reference
 from tests.reference.unknown import apply_unknown
+from tests.refused import expect_refusal
 
 LENGTHS = [10.0**exponent for exponent in range(-10, 3)]
 CENTERS, RADII = cloud(80)
@@ -88,8 +89,7 @@ def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
     ],
 )
 def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        field_over(Spheres.of(*cloud(10)), FieldConfig(distance=distance)).query(np.array(points))
+    expect_refusal(words, field_over(Spheres.of(*cloud(10)), FieldConfig(distance=distance)).query, np.array(points))
 
 
 @pytest.mark.parametrize(
@@ -101,10 +101,7 @@ def test_bad_queries_are_named(distance: str, points: ArrayLike, words: str) -> 
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        GpdfField(Spheres.of(*cloud(10)), FieldConfig(**settings))
-    with pytest.raises(UsageError, match=words):
-        FieldConfig(**settings)
+    expect_refusal(words, FieldConfig, error=UsageError, **settings)
 
 
 @pytest.mark.parametrize("weights", METHODS)

@@ -118,8 +118,7 @@ def test_safe_at_a_cell_is_never_above_the_exact_distance(distance: str) -> None
     config = replace(FieldConfig(voxel=0.02), distance=distance)
     box = Box(lower=np.array([-0.1, -0.2, -0.2]), upper=np.array([0.25, 0.2, 0.2]))
     grid = bake(splat_set(centers, radii), box, config)
-    verdict = judge("lone", grid, centers, radii, NUM)
-    assert verdict.excess["sdf_at_cell"][0] == 0
+    assert judge("lone", grid, centers, radii, NUM).excess["sdf_at_cell"][0] == 0
 
 
 @pytest.mark.parametrize("case", LONE_SPLATS, ids=str)

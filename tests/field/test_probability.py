@@ -59,8 +59,7 @@ def test_an_occupancy_beyond_float64_is_certain() -> None:
 
 
 def test_calibrated_probability_is_a_half_on_the_surface_and_sixteen_percent_one_sigma_away() -> None:
-    probability = CalibratedProbability(sigma=0.003)
-    found = probability.of(np.array([-0.003, 0.0, 0.003, 0.1]))
+    found = CalibratedProbability(sigma=0.003).of(np.array([-0.003, 0.0, 0.003, 0.1]))
     np.testing.assert_allclose(found, [0.8413447, 0.5, 0.1586553, 0.0], atol=1e-7)
     shifted = CalibratedProbability(sigma=0.003, mean=0.001).of(np.array([0.001, 0.004]))  # reads 1 mm too much
     np.testing.assert_allclose(shifted, [0.5, 0.1586553], atol=1e-7)

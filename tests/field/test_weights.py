@@ -30,8 +30,7 @@ def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.Mon
     centers, _ = cloud(60)
     centers = 0.1 * centers  # all within reach of each other
     expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / VOXELS_PER_LENGTH)
-    sums = voxel_row_sums(centers, LENGTH, MATERN.value)
-    np.testing.assert_allclose(sums, expected, rtol=1e-9)
+    np.testing.assert_allclose(voxel_row_sums(centers, LENGTH, MATERN.value), expected, rtol=1e-9)
     monkeypatch.setattr(weights_module, "NODES", 48)  # blocks of 15 cells rather than 63
     np.testing.assert_allclose(voxel_row_sums(centers + 7.0, LENGTH, MATERN.value), expected, rtol=1e-9)
 

@@ -3,7 +3,16 @@
 import pytest
 
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.conftest import arm, desk, few_points, short_sample, small_recording, splats, unchecked
+from tests.cli.conftest import (
+    arm,
+    desk,
+    few_points,
+    recording,
+    short_sample,
+    small_recording,
+    splats,
+    unchecked,
+)
 from tests.cli.replay_desk import Desk
 from tests.jobs.stage import Stage, run
 from tests.quick import painted, parsed_once, unpainted
@@ -14,6 +23,7 @@ __all__ = [
     "few_points",
     "painted",
     "parsed_once",
+    "recording",
     "run",
     "short_sample",
     "small_recording",

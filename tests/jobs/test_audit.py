@@ -145,7 +145,6 @@ def test_options_reach_every_step(desk: Desk) -> None:
 
 def test_another_robot_repeats_every_step(desk: Desk) -> None:
     desk.steps_made()
-    assert desk.request.urdf is not None
     desk.request.urdf.write_text(desk.request.urdf.read_text().replace("<robot", "<!-- again --><robot"))
     assert desk.steps_made() == ALL
 
@@ -188,8 +187,7 @@ def test_the_verdict_is_the_worse_one_of_logged_and_driven_motion(desk: Desk) ->
 
 def test_a_log_without_joints_has_its_map_and_check_alone(desk: Desk, tmp_path: Path) -> None:
     messages = [each for each in messages_of(desk.request.log) if each.topic.name != "/joint_states"]
-    log = write_raw(tmp_path / "still.mcap", messages)
-    result = desk.audit(log=log, urdf=None, spheres=None)
+    result = desk.audit(log=write_raw(tmp_path / "still.mcap", messages), urdf=None, spheres=None)
     assert result.verdict.exit_code == 5
     assert result.verdict.sentence == (
         "audit: NOT EVALUABLE (still.mcap): joint states: still.mcap has none, so no motion is judged, only the "
@@ -204,8 +202,7 @@ def test_spheres_are_fitted_once_where_the_urdf_has_none(desk: Desk, monkeypatch
 
     def fit(solids: dict[str, object], options: Any) -> SphereSet:
         asked.append(options.max_spheres)
-        rows = [(link, (0.0, 0.0, 0.0), 0.1) for link in solids]
-        links, centers, radii = zip(*rows, strict=True)
+        links, centers, radii = zip(*[(link, (0.0, 0.0, 0.0), 0.1) for link in solids], strict=True)
         return SphereSet(links=links, centers=np.array(centers), radii=np.array(radii))
 
     monkeypatch.setattr(module, "fit_spheres", fit)

@@ -234,10 +234,9 @@ def test_frames_of_a_capture_that_the_clock_leaves_without_a_pose_are_counted(
 
 def refused(setup: SetUp, folder: Path, **request: Any) -> str:
     """The refusal of a set-up, which leaves no file."""
-    with pytest.raises(NotEvaluableError) as refusal:
-        calibrated(setup, folder, **request)
+    said = expect_refusal("", calibrated, setup, folder, error=NotEvaluableError, **request)
     assert not list(folder.glob("rig.toml*"))
-    return str(refusal.value)
+    return said
 
 
 def test_cameras_that_see_nothing_in_common_are_named(tmp_path: Path) -> None:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs import demo as module
 from splatctrl_cli.jobs.demo import SAMPLE, DemoRequest, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.simulate.recording import RecordingOptions
+from tests.refused import expect_refusal
 
 
 @pytest.mark.parametrize(("damaged", "label"), [(0, "passed"), (1, "not as expected")])
@@ -44,10 +45,8 @@ def refused(words: Sequence[str], folder: Path) -> str:
 
 
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"has no log\.mcap, truth\.json"):
-        demo(DemoRequest(data=tmp_path, out=tmp_path / "out"), refused)
-    with pytest.raises(UsageError, match="is the input folder"):
-        demo(DemoRequest(out=SAMPLE), refused)
+    expect_refusal(r"has no log\.mcap, truth\.json", demo, DemoRequest(data=tmp_path, out=tmp_path / "out"), refused)
+    expect_refusal("is the input folder", demo, DemoRequest(out=SAMPLE), refused, error=UsageError)
 
 
 def test_without_the_sample_the_demo_simulates_its_recording_first(

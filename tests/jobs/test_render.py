@@ -45,7 +45,6 @@ def render(scene: Path, name: str = "out.png", **more: Any) -> RenderSceneResult
 def picture(scene: Path, **more: Any) -> Float64:
     """The picture (H, W, 3), RGB in [0, 1], by default of the depth."""
     image = cv2.imread(str(render(scene, **{"depth": True, **more}).out))
-    assert image is not None
     return np.asarray(image[:, :, ::-1], np.float64) / 255
 
 
@@ -95,8 +94,7 @@ def test_depth_is_red_near_by_blue_far_off_and_black_where_there_is_none(scene: 
 
 @pytest.mark.parametrize("name", ["path.csv", "path.json"])
 def test_along_a_path_the_camera_turns_evenly(scene: Path, tmp_path: Path, name: str) -> None:
-    aside = look_at([0.0, 0.0, 0.5], [1.0, 0.6, 0.5])
-    path = write_path(tmp_path / name, [0.0, 0.4], [FRONT, aside])
+    path = write_path(tmp_path / name, [0.0, 0.4], [FRONT, look_at([0.0, 0.0, 0.5], [1.0, 0.6, 0.5])])
     result = render(scene, "out", path=path, fps=5.0, depth=True)
     images = [cv2.imread(str(file)) for file in sorted(result.out.glob("*.png"))]
     assert result.num_pictures == len(images) == 3

@@ -21,8 +21,7 @@ def splats(count: int = 60, seed: int = 0) -> Arrays:
     centers = rng.uniform([-0.4, -0.4, 0.0], [0.4, 0.4, 0.3], (count, 3)).astype(np.float32)
     radii = rng.uniform(0.01, 0.08, count).astype(np.float32)
     opacities = rng.uniform(0.02, 0.98, count).astype(np.float32)
-    colors = rng.uniform(0, 1, (count, 3)).astype(np.float32)
-    return centers, radii, opacities, colors
+    return centers, radii, opacities, rng.uniform(0, 1, (count, 3)).astype(np.float32)
 
 
 def points_bytes() -> bytes:

@@ -111,8 +111,7 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
 
 def test_triangles_show_what_their_solid_shows() -> None:
     center, radius = np.array([0.05, -0.02, 0.9]), 0.15
-    T = pose_at(center)
-    ball = rendered(scene_of([("sphere", (radius,), T)]))
+    ball = rendered(scene_of([("sphere", (radius,), pose_at(center))]))
     faces = rendered(scene_of([], ball_faces(center, radius)))
     both = (ball.depth > 0) & (faces.depth > 0)
     assert both.sum() > 200
@@ -157,8 +156,7 @@ def test_of_two_triangles_in_one_place_the_first_shows(is_first_from_inside: boo
 def test_a_triangle_that_reaches_behind_the_camera_hides_none() -> None:
     near = np.array([[-0.2, -0.2, 0.5], [0.2, -0.2, 0.5], [0.0, 0.3, -0.1]])
     far = np.array([[-0.2, -0.2, 1.0], [0.2, -0.2, 1.0], [0.0, 0.3, 1.0]])
-    image = rendered(mesh_scene(np.array([near, far]), [1, 2]))
-    assert set(np.unique(image.link)) == {-1, 2}
+    assert set(np.unique(rendered(mesh_scene(np.array([near, far]), [1, 2])).link)) == {-1, 2}
 
 
 def test_a_mesh_without_poses_for_all_its_links_is_refused() -> None:

@@ -11,7 +11,6 @@ from experiments.problems import simulated_arm
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.birrt import plan
 from splatctrl_cli.planner.configuration_clearance import Ball, Clearance, Solids
@@ -32,6 +31,7 @@ from splatctrl_cli.planner.planned import (
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 from tests.planner.walls import one_wall
+from tests.refused import expect_refusal
 
 ARM = PlanarArm()
 CONFIG, PLANNER = ControlConfig(), PlannerConfig(max_iterations=300, max_time=60.0)
@@ -182,10 +182,8 @@ def test_a_timed_path_keeps_its_limits_and_its_edges() -> None:
 
 
 def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
-    with pytest.raises(InputError, match="expected at least 2 waypoints, got 1"):
-        time_path(PATH[:1], ARM.velocity_limit, 3.0)
-    with pytest.raises(InputError, match="limits above 0"):
-        time_path(PATH, np.zeros(2), 3.0)
+    expect_refusal("expected at least 2 waypoints, got 1", time_path, PATH[:1], ARM.velocity_limit, 3.0)
+    expect_refusal("limits above 0", time_path, PATH, np.zeros(2), 3.0)
 
 
 def test_a_path_keeps_the_speed_of_a_frame_too() -> None:

@@ -117,8 +117,7 @@ def process_se(points: Array, centers: Array, radii: Array, length: float, noise
 
 def explained(points: Array, centers: Array, length: float, noise: float) -> Array:
     """What eq. 13 takes off k(x, x), lumped by eq. 15: ``sum_i w_i k(x, p_i)^2``."""
-    squared = np.exp(-2 * distances(points, centers) / length)
-    return squared @ (1 / (noise + row_sums(centers, length)))
+    return np.exp(-2 * distances(points, centers) / length) @ (1 / (noise + row_sums(centers, length)))
 
 
 def collision_probability(occupancy: Array, variance: Array) -> Array:

@@ -31,5 +31,4 @@ def ray_walk(frame: RgbdFrame, origin: Float64, voxel: float, shape: tuple[int, 
 
 
 def _inside(cells: Float64, shape: tuple[int, int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    kept = cells[np.all((cells >= 0) & (cells < shape), axis=1)]
-    return kept.astype(np.int64)
+    return cells[np.all((cells >= 0) & (cells < shape), axis=1)].astype(np.int64)

@@ -65,8 +65,7 @@ def cube_means(points: Float32, colors: Float32, edge: float) -> dict[str, Float
 
 def are_further(centers: Float32, radii: Float32, points: Float64, gap: float) -> Bool:
     """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
-    ranks = np.arange(1, min(8, len(radii)) + 1)
-    distance, nearest = cKDTree(centers).query(points, k=ranks)
+    distance, nearest = cKDTree(centers).query(points, k=np.arange(1, min(8, len(radii)) + 1))
     return np.asarray((distance - radii[nearest]).min(axis=1) > gap)
 
 

@@ -54,7 +54,6 @@ def composed(
         is_last = is_seen & (T * (1 - alpha) < MIN_TRANSMITTANCE)
         is_live = is_live & ~is_last
         weight = torch.where(is_seen & ~is_last, alpha * T, torch.zeros_like(T))
-        features = torch.stack([*colors[i], z, torch.ones_like(z)])
-        planes = planes + features[:, None, None] * weight
+        planes = planes + torch.stack([*colors[i], z, torch.ones_like(z)])[:, None, None] * weight
         T = T - weight
     return planes

@@ -108,8 +108,7 @@ def test_what_could_not_run_or_was_not_run_or_was_killed_is_no_pass() -> None:
 
 def test_what_was_expected_to_fail_passes_and_fails_where_it_passes() -> None:
     assert {case.kind for case in cases_of(VERDICT, GROUP, expected="failed")} == {Kind.PASSED}
-    passed = verdict_of("replay", [FAR]).as_dict()
-    first, second = cases_of(passed, GROUP, expected="failed")
+    first, second = cases_of(verdict_of("replay", [FAR]).as_dict(), GROUP, expected="failed")
     assert (first.kind, first.sentence, second.kind) == (Kind.FAILED, "expected 'failed', got 'passed'", Kind.PASSED)
 
 
@@ -169,8 +168,7 @@ def test_an_annotation_is_one_line_that_gives_back_its_text() -> None:
     head, _, text = line.removeprefix("::error ").partition("::")
     assert "," not in head
     assert head.count(":") == 0
-    back = text.replace("%0A", "\n").replace("%0D", "\r").replace("%25", "%")
-    assert back == odd.text
+    assert text.replace("%0A", "\n").replace("%0D", "\r").replace("%25", "%") == odd.text
 
 
 def test_the_file_of_an_annotation_is_the_recording_where_the_repository_has_it(tmp_path: Path) -> None:
@@ -191,8 +189,7 @@ def test_the_file_of_an_annotation_is_the_recording_where_the_repository_has_it(
 
 def test_a_summary_has_a_row_for_each_case_that_is_not_passed_and_no_markup_of_others() -> None:
     cases = [case_of(Kind.PASSED), case_of(Kind.FAILED, sentence="a | b <script>\nnext *x*"), case_of(Kind.ERROR)]
-    text = summary([suite_of(*cases)], 10_000)
-    head, *rows = [line for line in text.splitlines() if line]
+    head, *rows = [line for line in summary([suite_of(*cases)], 10_000).splitlines() if line]
     assert head == "### splatctrl: log.mcap: 1 of 3 criteria passed, 1 failed, 1 error"
     assert len(rows) == 4
     assert "a &#124; b &#60;script&#62; next &#42;x&#42;" in rows[2]
@@ -201,8 +198,7 @@ def test_a_summary_has_a_row_for_each_case_that_is_not_passed_and_no_markup_of_o
 
 @pytest.mark.parametrize("room", [0, 100, 400, 1000, 3000, 100_000])
 def test_a_summary_keeps_within_its_room_and_says_what_it_leaves_out(room: int) -> None:
-    suites = [suite_of(*[case_of(Kind.FAILED, sentence="é" * 20)] * 50)]
-    text = summary(suites, room)
+    text = summary([suite_of(*[case_of(Kind.FAILED, sentence="é" * 20)] * 50)], room)
     assert len(text.encode()) <= room
     shown = text.count("| failed |")
     assert shown == 50 or f"... and {50 - shown} more that do not fit here" in text or room < 300

@@ -125,8 +125,7 @@ def drawn_bytes(name: str) -> bytes:
 
 def picture_of(data: bytes) -> UInt8:
     """Blue, green and red of each pixel."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return np.asarray(image, np.uint8)
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 
 
 @pytest.mark.parametrize("name", DRAWN)

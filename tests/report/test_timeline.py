@@ -30,8 +30,7 @@ def points(svg: str, name: str) -> list[list[tuple[float, float]]]:
 
 
 def test_a_curve_runs_over_the_whole_axis_and_breaks_where_there_is_no_value() -> None:
-    exact = np.array([0.04, 0.02, np.nan, 0.06, 0.08])
-    svg = timeline(SECONDS, {"exact": exact}, 0.02, {})
+    svg = timeline(SECONDS, {"exact": np.array([0.04, 0.02, np.nan, 0.06, 0.08])}, 0.02, {})
     first, second = points(svg, "to the splats")
     assert first[0][0] == LEFT and second[-1][0] == WIDTH - RIGHT
     assert len(first) == len(second) == 2

@@ -79,8 +79,7 @@ def test_bounds_on_the_uncovered_area_hold_a_dense_sample(seed: int) -> None:
 def test_a_hole_between_two_spheres_that_no_corner_sees_is_found() -> None:
     centers = np.array([[-0.06, 0, 0], [0.06, 0, 0]])
     sheet = np.array([[[-0.1, -0.02, 0], [0.1, -0.02, 0], [0, 0.03, 0]]])
-    found = largest_deficit(sheet, centers, np.array([0.0599, 0.0599]))
-    assert found.found > 0
+    assert largest_deficit(sheet, centers, np.array([0.0599, 0.0599])).found > 0
     assert max(phi(sheet[0], centers, np.array([0.0599, 0.0599]))[:2]) < 0
 
 

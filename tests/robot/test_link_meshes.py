@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.robot.link_meshes import SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import read_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import BALL, BOX, ROD, arm_of, collada, l_shape, written
 
 
@@ -23,11 +23,10 @@ def rod_distance(p: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
 
 
-def ball_distance(p: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(p, axis=1) - 0.08
-
-
-@pytest.mark.parametrize(("shape", "truth"), [(BOX, box_distance), (ROD, rod_distance), (BALL, ball_distance)])
+@pytest.mark.parametrize(
+    ("shape", "truth"),
+    [(BOX, box_distance), (ROD, rod_distance), (BALL, lambda points: np.linalg.norm(points, axis=1) - 0.08)],
+)
 def test_signed_distance_to_a_primitive_is_that_of_its_formula(tmp_path: Path, shape: str, truth) -> None:  # type: ignore[no-untyped-def]
     (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(shape, BALL))))["base"]
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3))
@@ -87,10 +86,7 @@ def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder:
         )
     )
     if folder is not None:
-        with pytest.raises(
-            InputError, match=r"link 'base': mesh package://far/ell.stl was not found; give the folder"
-        ):
-            read_solids(urdf)
+        expect_refusal(r"link 'base': mesh package://far/ell.stl was not found; give the folder", read_solids, urdf)
     folders = [] if folder is None else [tmp_path / folder]
     assert len(read_solids(urdf, folders)["base"][0].surface.faces) == 20
 
@@ -111,8 +107,8 @@ def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder:
     ],
 )
 def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(InputError, match=f"robot.urdf.*{words}"):
-        read_solids(read_urdf(written(tmp_path, text)))
+    urdf = written(tmp_path, text)
+    expect_refusal(f"robot.urdf.*{words}", lambda: read_solids(read_urdf(urdf)))
 
 
 def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull_where_it_has_one(tmp_path: Path) -> None:
@@ -137,8 +133,7 @@ def test_a_visual_mesh_is_read_from_collada_in_its_unit(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), float(unit) * np.array([1, 2, 3]), rtol=1e-6)
         assert len(mesh.faces) == 12
     (tmp_path / "box.dae").write_text(text[:300])
-    with pytest.raises(InputError, match=r"box\.dae: expected a mesh, got "):
-        load_mesh(tmp_path / "box.dae")
+    expect_refusal(r"box\.dae: expected a mesh, got ", load_mesh, tmp_path / "box.dae")
 
 
 def test_a_collada_mesh_of_several_parts_is_whole() -> None:
@@ -146,8 +141,7 @@ def test_a_collada_mesh_of_several_parts_is_whole() -> None:
     loading = pytest.importorskip(
         "tools.mujoco.robots", reason="the robots are not installed: pip install -e '.[sim]'"
     )
-    path = loading.robots_folder() / "ur_description/meshes/ur5/visual/wrist1.dae"
-    mesh = load_mesh(path)
+    mesh = load_mesh(loading.robots_folder() / "ur_description/meshes/ur5/visual/wrist1.dae")
     area = 0.5 * np.linalg.norm(np.cross(*np.diff(mesh.corners, axis=1).swapaxes(0, 1)), axis=1).sum()
     assert area == pytest.approx(0.0461, rel=0.01)
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.077, 0.085, 0.105], atol=1e-3)

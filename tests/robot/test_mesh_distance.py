@@ -96,8 +96,7 @@ def test_an_open_mesh_has_no_inside_and_a_seam_does_not_open_one(tmp_path: Path)
     box.unmerge_vertices()  # as the seams of a texture leave it
     box.export(tmp_path / "seams.stl")
     assert load_mesh(tmp_path / "seams.stl").is_closed
-    opened = trimesh.Trimesh(box.vertices, box.faces[:-1], process=False)
-    opened.export(tmp_path / "open.stl")
+    trimesh.Trimesh(box.vertices, box.faces[:-1], process=False).export(tmp_path / "open.stl")
     mesh = load_mesh(tmp_path / "open.stl")
     assert not mesh.is_closed
     assert MeshDistance(mesh).signed(np.zeros((1, 3)))[0] == pytest.approx(0.1)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import read_srdf, self_collision_pairs
+from tests.refused import expect_refusal
 from tests.robot.shapes import BALL, arm_of, written
 
 
@@ -98,9 +98,7 @@ def test_an_srdf_takes_the_place_of_the_sample(arm: RobotModel, tmp_path: Path) 
     ],
 )
 def test_unusable_srdfs_are_refused_by_name(arm: RobotModel, tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        read_srdf(written(tmp_path, text, "c.srdf"), arm.urdf)
-    assert "c.srdf" in str(caught.value)
+    assert "c.srdf" in expect_refusal(message, read_srdf, written(tmp_path, text, "c.srdf"), arm.urdf)
 
 
 def test_the_panda_srdf_names_only_links_of_the_panda(real_data: Path) -> None:

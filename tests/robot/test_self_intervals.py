@@ -86,15 +86,13 @@ def test_a_bracket_is_robot_always_beside_a_box_that_is_held_for_a_time() -> Non
 def test_what_stands_beside_the_arm_while_it_stays_is_not_taken() -> None:
     """The arm comes to the box, waits and wags a little, and goes on."""
     wait = [(PATH[8][0] + 0.02 * np.sin(k), PATH[8][1]) for k in range(8)]
-    moves = [*PATH[:8], *wait, *PATH[9:]]
-    found = learn(ROBOT, LINKS, *seen(moves, range(8, 9)))
+    found = learn(ROBOT, LINKS, *seen([*PATH[:8], *wait, *PATH[9:]], range(8, 9)))
     assert [part for part in found.learned if len(part.triangles)] == []
 
 
 def test_moments_part_a_way_there_and_back() -> None:
     turns = [*np.linspace(0, 1.5, 30), *np.linspace(1.5, 0, 30)]
-    at = np.array([ROBOT.poses(poses(turn, 0.0)) for turn in turns])
-    chosen = choose_moments(ROBOT, at, most=12)
+    chosen = choose_moments(ROBOT, np.array([ROBOT.poses(poses(turn, 0.0)) for turn in turns]), most=12)
     assert len(chosen) == 12 and max(np.diff(chosen)) <= 9
 
 

@@ -169,8 +169,7 @@ def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> Non
 def test_pairs_of_an_srdf_or_that_no_posture_parts_are_not_judged(tmp_path: Path) -> None:
     model, _ = folding_arm(tmp_path, covering_spheres())
     solids = read_solids(model.urdf)
-    off = {frozenset(("drum", "block"))}
-    silent = SelfSurfaces(model, solids, off)
+    silent = SelfSurfaces(model, solids, {frozenset(("drum", "block"))})
     assert silent.pairs == silent.names == ()
     assert nearest(model, silent, FOLDED)[0] == np.inf
     low = URDF.replace('xyz="0 0 0.052"', 'xyz="0 0 0.02"')
@@ -226,7 +225,6 @@ def test_a_pair_that_is_never_apart_keeps_what_keeps_its_surfaces_apart(
     assert np.mean(spheres[surface > 0.9 * GAP] >= kept.margin) > 0.9
     bare, surfaces = folding_arm(tmp_path, covering_spheres(parts=("block", "neck", "drum")))
     (told,) = kept_margins(bare, MARGIN, surfaces)  # spheres that do not tell when surfaces meet are known for it
-    assert told.margin is not None and told.surface_gap is not None
     assert 0 < told.margin < 0.01 and told.surface_gap < 0
 
 

@@ -187,8 +187,7 @@ def test_a_tool_at_the_tip_of_a_link_that_moves_slightly_is_found() -> None:
 def test_what_a_slight_motion_cannot_tell_from_the_scene_is_no_part(beside: list[Shape]) -> None:
     """The bracket moves with the arm, but by less than 40 mm."""
     truth = RobotSurface.from_parts([*shapes(has_bracket=False), *beside])
-    refused = r"arm.* moves? too little"
-    expect_refusal(refused, learn, ROBOT, LINKS, *recorded(SLIGHT, truth))
+    expect_refusal(r"arm.* moves? too little", learn, ROBOT, LINKS, *recorded(SLIGHT, truth))
 
 
 def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:

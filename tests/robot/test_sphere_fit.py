@@ -111,8 +111,7 @@ def test_the_same_seed_gives_the_same_spheres(solids: Solids, six: SphereSet) ->
 
 def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
     sheet = trimesh.creation.box(extents=(0.2, 0.1, 0.001))
-    opened = trimesh.Trimesh(sheet.vertices, sheet.faces[1:], process=False)
-    opened.export(tmp_path / "open.stl")
+    trimesh.Trimesh(sheet.vertices, sheet.faces[1:], process=False).export(tmp_path / "open.stl")
     flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]], process=False)
     flat.export(tmp_path / "flat.stl")
     urdf = read_urdf(written(tmp_path, arm_of('<mesh filename="open.stl"/>', '<mesh filename="flat.stl"/>')))

@@ -164,8 +164,7 @@ def test_a_link_with_triangles_is_as_clear_as_its_surface_and_no_sphere_says_les
 
     scene = BallDistance(of_points=of_points, centers=centers, radii=radii)
     each, is_surface = part_clearances(model, np.array([[q]]), scene)
-    T = model.frame_pose(np.array([q]), "tip")
-    there = transform_points(invert_transform(T), centers)
+    there = transform_points(invert_transform(model.frame_pose(np.array([q]), "tip")), centers)
     assert each.min() == pytest.approx(distance_to_triangles(there, l_shape().triangles).min() - 0.02, abs=1e-6)
     assert is_surface.all()
     assert not part_clearances(model, np.array([[q]]), of_points)[1].any()
@@ -180,8 +179,7 @@ def test_what_a_link_with_triangles_carries_or_has_of_boxes_counts_as_well(tmp_p
     model = with_visual(tmp_path, "ell.stl")
     q = np.zeros((1, 1))
     scene = np.array([[0.0, 0.0, 0.3 - 0.55]]), np.array([0.05])
-    bare = model.surface_gaps(q, *scene)["tip"][0]
-    assert bare == pytest.approx(0.5, abs=1e-6)
+    assert model.surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.5, abs=1e-6)
     box = Box(lower=np.array([-0.05, -0.05, -0.4]), upper=np.array([0.05, 0.05, -0.3]))
     assert model.carrying([("tip", box)]).surface_gaps(q, *scene)["tip"][0] == pytest.approx(0.1, abs=1e-6)
     part = held_part("tip", np.asarray(trimesh.creation.box(bounds=[box.lower, box.upper]).triangles), *ALWAYS)

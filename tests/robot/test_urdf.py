@@ -90,7 +90,6 @@ def test_the_hand_of_a_real_arm_moves_with_its_last_link(real_data: Path) -> Non
 
 def test_a_robot_is_seen_by_its_visual_geometry_and_where_it_has_none_by_what_collides(tmp_path: Path) -> None:
     visual = f'<link name="base"><visual><geometry>{ROD}</geometry></visual>'
-    text = arm_of(BOX, BALL).replace('<link name="base">', visual)
-    urdf = read_urdf(written(tmp_path, text))
+    urdf = read_urdf(written(tmp_path, arm_of(BOX, BALL).replace('<link name="base">', visual)))
     assert [(s.link, s.kind) for s in urdf.shapes] == [("base", "box"), ("tip", "sphere")]
     assert [(s.link, s.kind) for s in visual_urdf(urdf).shapes] == [("base", "cylinder"), ("tip", "sphere")]

@@ -90,8 +90,7 @@ def test_what_the_map_shows_needs_no_seed() -> None:
 
 
 def test_views_without_any_depth_have_no_scale_to_place_a_backdrop() -> None:
-    blank = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in views()]
-    assert len(seeds_of(blank)) == 0
+    assert len(seeds_of([replace(frame, depth=np.zeros_like(frame.depth)) for frame in views()])) == 0
 
 
 def fitted(*, has_backdrop: bool) -> SceneFitter:
@@ -107,7 +106,6 @@ def test_a_backdrop_is_rendered_beside_a_map_that_knows_nothing_of_it() -> None:
     plain, behind = fitted(has_backdrop=False), fitted(has_backdrop=True)
     backdrop = behind.shell_splats()
     assert plain.shell_splats() is None
-    assert backdrop is not None
     assert WORKSPACE.contains(behind.splats().centers).all()
     assert len(behind.splats()) + len(backdrop) == np.count_nonzero(behind.buffer.is_alive)
     assert set(backdrop.labels.tolist()) == {Label.OBJECT}
@@ -121,6 +119,4 @@ def test_a_resumed_fitter_keeps_its_backdrop() -> None:
     second = SceneFitter(first.config, OccupancyConfig(), WORKSPACE, threads=1, has_backdrop=True)
     restore_fitter(second, fitter_state(first))
     kept, backdrop = first.shell_splats(), second.shell_splats()
-    assert kept is not None
-    assert backdrop is not None
     np.testing.assert_array_equal(backdrop.centers, kept.centers)

@@ -52,7 +52,6 @@ def test_objects_in_contact_get_splats_of_one_radius_up_to_what_is_measured() ->
 
 def test_a_carried_box_that_pixels_need_is_used_and_one_in_the_air_is_not() -> None:
     robot, view = ball(0.3, 0.05), frame(block=VISITOR)
-    assert robot.surface is not None
     held = Box(lower=np.array([-0.1, -0.1, -0.3]), upper=np.array([0.1, 0.1, VISITOR - 0.3]))  # in the ball's frame
     aside = Box(lower=np.array([0.2, 0.2, 0.0]), upper=np.array([0.3, 0.3, 0.1]))
     declared = Declarations(
@@ -70,7 +69,6 @@ def test_what_the_robot_hides_of_an_object_is_not_fitted_to_the_robot() -> None:
     """Nor what stands on what a robot's base hides."""
     robot, slots = ball(0.3), splats_at((0.0, 0.0, 0.19), (0.3, 0.2, 0.0), (0.0, 0.0, 0.4))
     slots.labels[2] = Label.ROBOT
-    assert robot.surface is not None
     base = replace(robot, surface=replace(robot.surface, fixed=("arm",)))
     for posture, hidden in ((robot, [0]), (None, []), (base, [0])):
         assert hidden_objects(slots, posture, [seen_and_masked(robot)], OccupancyConfig()).tolist() == hidden
@@ -91,7 +89,6 @@ def test_gaps_at_a_fixed_link_are_filled_where_a_surface_lasts(
 ) -> None:
     robot = ball(0.15)
     view = seen_with(robot)
-    assert robot.surface is not None
     base = replace(robot, surface=replace(robot.surface, fixed=("arm",) if is_fixed else ()))
     lasting = np.full(view.depth.shape, lasts)
     found = lasts_at_fixed_links(base, [view], [lasting], OccupancyConfig(), np.array([place], np.float32))
@@ -99,18 +96,13 @@ def test_gaps_at_a_fixed_link_are_filled_where_a_surface_lasts(
 
 
 def test_the_first_map_is_filled_before_anything_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = list[np.ndarray]()
-
-    def record(*given: Any) -> np.ndarray:
-        calls.append(given[2][0])
-        return np.zeros(len(given[4]), bool)
-
-    monkeypatch.setattr(fitter_module, "lasts_at_fixed_links", record)
+    spy = Mock(side_effect=lambda *given: np.zeros(len(given[4]), bool))
+    monkeypatch.setattr(fitter_module, "lasts_at_fixed_links", spy)
     target, robot, view = robot_over_the_floor()
-    assert not calls
+    assert not spy.called
     target.step([view], robot)
-    assert len(calls) == 1
-    assert calls[0].any()
+    spy.assert_called_once()
+    assert spy.call_args.args[2][0].any()
 
 
 def robot_over_the_floor() -> tuple[SceneFitter, RobotPosture, RgbdFrame]:

@@ -109,6 +109,5 @@ def test_a_point_behind_the_camera_has_no_pixel() -> None:
     """Nor the camera's own place: the point mirrored at it has one."""
     seen = view(0).frame
     place = seen.T_world_camera[:3, 3]
-    points = np.array([POST[0], place, 2.0 * place - POST[0]])
-    pixel, z = pixels_at(seen, points)
+    pixel, z = pixels_at(seen, np.array([POST[0], place, 2.0 * place - POST[0]]))
     assert (pixel >= 0).tolist() == [True, False, False] and z[2] == -z[0]

@@ -51,7 +51,6 @@ def test_human_voxels_are_those_that_hold_the_point_of_a_human_pixel() -> None:
     view = masked(frame(block=0.21, x=0.013))
     grid = grid_of(view)
     points = transform_points(view.T_world_camera, back_project(view.intrinsics, view.depth.astype(np.float64)))
-    assert view.human is not None
     expected = np.zeros(grid.entity.shape, bool)
     expected[tuple(np.floor((points[view.human > 0] - WORKSPACE.lower) / grid.config.voxel).astype(int).T)] = True
     assert ((grid.entity & Label.HUMAN > 0) == expected).all() and 50 < expected.sum() < 200

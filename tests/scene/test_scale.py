@@ -38,7 +38,6 @@ def fitted(factor: float, given: Config = CONFIG) -> SplatSet:
     """The map of a block on a floor, `factor` times as large."""
     frames = [larger(frame(0, block=0.2, x=x, camera=f"cam{k}"), factor) for k, x in enumerate((0.1, -0.1))]
     depth = RecordedDepth.of(frames)
-    assert depth is not None
     config, box = fitted_to(given, depth), Box(lower=WORKSPACE.lower * factor, upper=WORKSPACE.upper * factor)
     target = SceneFitter(config.scene, config.occupancy, box)
     target.step(frames)
@@ -76,12 +75,10 @@ def test_lengths_grow_with_the_depth_and_what_is_set_stays() -> None:
 def test_a_splat_may_be_as_small_as_a_pixel(pixel: float, expected: float) -> None:
     depth = replace(ROOM, pixel=pixel)
     assert fitted_to(Config(), depth).scene.min_radius == pytest.approx(expected)
-    given = SceneConfig(min_radius=0.008)
-    assert fitted_to(Config(scene=given), depth).scene.min_radius == 0.008
+    assert fitted_to(Config(scene=SceneConfig(min_radius=0.008)), depth).scene.min_radius == 0.008
     assert fitted_to(Config(), depth, has_robot=True).scene.min_radius == SceneConfig().min_radius
     seen = frame(0, block=0.2)
     recorded = RecordedDepth.of([seen])
-    assert recorded is not None
     assert recorded.pixel == pytest.approx(recorded.median / seen.intrinsics.fx)
 
 
@@ -99,8 +96,7 @@ def test_the_noise_of_depth_is_found_on_slanted_surfaces_and_beside_edges(noise:
     assert depth_noise([slanted(noise)]) == pytest.approx(noise, rel=0.15)
     assert depth_noise([slanted(noise, seed) for seed in range(3)]) == pytest.approx(noise, rel=0.15)
     frames = [replace(frame(camera=f"{each}"), depth=slanted(each)) for each in (0.0003, noise)]
-    depth = RecordedDepth.of(frames)
-    assert depth.noise == pytest.approx(noise, rel=0.15)
+    assert RecordedDepth.of(frames).noise == pytest.approx(noise, rel=0.15)
 
 
 def test_noise_that_neighbouring_pixels_share_is_found_though_a_narrow_fit_takes_it_away() -> None:

@@ -98,8 +98,7 @@ def test_what_is_nearer_than_the_least_range_is_not_mapped() -> None:
 
 
 def test_points_lie_on_the_floor_they_were_seen_on() -> None:
-    seen = frame(x=0.1, y=-0.05)
-    assert np.abs(world_points(seen)[..., 2]).max() < 1e-6
+    assert np.abs(world_points(frame(x=0.1, y=-0.05))[..., 2]).max() < 1e-6
 
 
 def coloured(count: int = 20000) -> tuple[Float32, Float32]:

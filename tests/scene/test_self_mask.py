@@ -99,8 +99,7 @@ def test_what_stands_before_the_robot_is_an_object_however_near(gap: float) -> N
 
 def test_what_touches_the_robot_from_the_side_is_an_object() -> None:
     beside = ball_depth(CENTER + np.array([0.15, 0.0, 0.0]), 0.05)
-    is_beside = np.isfinite(beside) & ~SHOWN
-    found = kinds(np.minimum(ball_depth(), beside))[is_beside]
+    found = kinds(np.minimum(ball_depth(), beside))[np.isfinite(beside) & ~SHOWN]
     assert len(found) > 150 and (found == PixelKind.OBJECT).mean() > 0.9
 
 

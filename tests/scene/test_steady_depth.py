@@ -34,7 +34,6 @@ def after(depths: list[Float32]) -> Float32:
     shown = None
     for depth in depths:
         shown, _ = steady(frame_of(depth), shown)
-    assert shown is not None
     return shown.depth
 
 

@@ -60,8 +60,7 @@ def test_too_little_of_a_plane_says_nothing() -> None:
 
 @pytest.mark.parametrize("sigmas", [1.0, 4.0])
 def test_the_plane_is_the_least_squares_plane_of_the_pixels_beyond(sigmas: float) -> None:
-    rng = np.random.default_rng(3)
-    depth = table(rng)
+    depth = table(np.random.default_rng(3))
     depth[102, 150] -= np.float32(0.004 + sigmas * 2.0 * ERROR * 1.4**2)
     v, u = 102, 150
     z = float(depth[v, u])

@@ -69,8 +69,7 @@ def test_each_voxel_beside_the_robot_has_its_reason() -> None:
 
 
 def test_what_no_camera_looks_at_is_out_of_view() -> None:
-    away = replace(ROBOT, centers=MIDDLE[None] + [0.4, 0.0, 0.2])
-    grid = explained(frame(x=-0.4), robot=away)
+    grid = explained(frame(x=-0.4), robot=replace(ROBOT, centers=MIDDLE[None] + [0.4, 0.0, 0.2]))
     assert class_at(grid, (0.43, 0.0, 0.35)) == [EvidenceClass.OUT_OF_VIEW]
 
 

@@ -138,6 +138,5 @@ def test_an_unmodelled_part_stands_out_of_the_link_that_carries_it(arm: RobotMod
     link, capsules = UNMODELLED[name]
     assert all(isinstance(capsule, Capsule) for capsule in capsules)
     own = [solid(shape) for shape in arm.urdf.shapes if shape.link == link]
-    points = np.concatenate([np.linspace(c.start, c.end, 20) for c in capsules])
-    distance = distance_to(own, points, 0)
+    distance = distance_to(own, np.concatenate([np.linspace(c.start, c.end, 20) for c in capsules]), 0)
     assert distance.max() > 0.015 and distance.min() < 0.02

@@ -15,8 +15,7 @@ QUIET = StereoDepth(spread=0.0, dropout=0.0)
 def test_noise_has_the_stated_spread_and_grows_with_depth_squared() -> None:
     noise = DepthNoise(step=1e-5, dropout=0.0)
     for depth in (1.0, 2.0):
-        exact_depth = np.full((240, 320), depth, np.float32)
-        noisy = noise.applied(exact_depth, np.random.default_rng(0))
+        noisy = noise.applied(np.full((240, 320), depth, np.float32), np.random.default_rng(0))
         assert np.std(noisy - depth) == pytest.approx(noise.spread * depth**2, rel=0.1)
 
 
@@ -92,8 +91,7 @@ def test_the_wall_takes_the_depth_of_the_box_for_one_to_three_depth_pixels(focal
     exact, scale = before_a_wall(), focal / FOCAL
     found = measured(QUIET, exact, focal=focal)
     is_fat = (exact == 2.0) & (np.abs(found - 1.0) < 0.01)
-    beyond = distance_transform_edt(exact == 2.0)
-    assert beyond[is_fat].max() < 3 * scale + 1.5
+    assert distance_transform_edt(exact == 2.0)[is_fat].max() < 3 * scale + 1.5
     assert (np.abs(found - 1.0) < 0.01)[exact == 1.0].all()
     rows, columns = slice(175, 305), slice(245, 395)
     widths = [is_fat[rows, :240].sum(1), is_fat[rows, 400:].sum(1), is_fat[:170, columns].sum(0)]
@@ -137,8 +135,7 @@ def test_what_is_nearer_than_28_cm_or_too_far_is_lost_and_dropouts_are_blobs() -
 
 
 def test_imagers_of_their_own_width_err_alike_at_any_width_of_the_image() -> None:
-    small = replace(StereoDepth(), width=640)
-    found = measured(small, plane(1.0, (96, 128)), focal=128.0)
+    found = measured(replace(StereoDepth(), width=640), plane(1.0, (96, 128)), focal=128.0)
     assert np.std(found[found > 0]) == pytest.approx(0.0036, rel=0.1)
     exact = plane(2.0, (96, 128))
     exact[30:70, 40:90] = 1.0

@@ -22,6 +22,7 @@ from splatctrl_cli.simulate.arm import hand_pose
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.render import Meshes, Renderer
+from tests.refused import expect_refusal
 from tests.robot.shapes import JOINTS, arm_of, ur10e_urdf, written
 from tests.simulate.limits import DURATIONS, assert_keeps_limits
 
@@ -138,8 +139,7 @@ def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path) -> None:
     gaps = meeting.gaps(np.array([other.at(second)[0] for second in seconds]), np.zeros(0), 0.0)
     assert gaps.min() > -0.05 and not np.allclose(other.waypoints, motion.waypoints)
     Meeting.radius = 100.0
-    with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
-        adapt_motion(scene, model, meeting)
+    expect_refusal("expected a way between the waypoints, got none", adapt_motion, scene, model, meeting)
 
 
 @pytest.mark.parametrize("duration", DURATIONS[::2])
@@ -163,5 +163,4 @@ def test_free_space_has_floor_and_walls_alone() -> None:
     scene = Scene.of(RecordingOptions(is_free=True))
     assert {p.name for p in scene.primitives} == {"floor", "wall_back", "wall_left", "wall_right"}
     assert scene.temporary == ()
-    with pytest.raises(UsageError, match="--free: expected no --person"):
-        RecordingOptions(is_free=True, with_person=True)
+    expect_refusal("--free: expected no --person", RecordingOptions, is_free=True, with_person=True, error=UsageError)

@@ -74,8 +74,7 @@ def test_the_window_of_a_solid_loses_no_pixel(exact: Recording) -> None:
 
 
 def test_the_visitor_comes_after_a_third_and_leaves_after_two(exact: Recording) -> None:
-    visitor = exact.primitives[-1]
-    middle = visitor.T_world_shape[None, :3, 3]
+    middle = exact.primitives[-1].T_world_shape[None, :3, 3]
     stamps = [exact.start_ns + int(second * 1e9) for second in (0.9, 1.1, 1.9, 2.1)]
     inside = [bool(distance_to(exact.primitives, middle, stamp)[0] < 0) for stamp in stamps]
     assert inside == [False, True, True, False]
@@ -182,8 +181,7 @@ def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> Non
     ],
 )
 def test_options_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        RecordingOptions(**options)
+    expect_refusal(message, RecordingOptions, error=UsageError, **options)
 
 
 def truth_of(recording: Recording, path: Path) -> Truth:

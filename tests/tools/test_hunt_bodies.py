@@ -23,6 +23,12 @@ from tools.hunt.world import at_s, draw_cameras
 EXACT = StereoDepth(spread=0.0, fattening=(0.0, 0.0), dropout=0.0, width=640)
 
 
+@pytest.fixture(autouse=True)
+def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Record two frames a camera, an eighth of a run."""
+    monkeypatch.setattr("tools.hunt.recording.NUM_FRAMES", 2)
+
+
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
     return true_robot(tmp_path_factory.mktemp("robot"))

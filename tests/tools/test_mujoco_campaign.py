@@ -125,8 +125,7 @@ def test_causes_are_weighed_and_a_map_without_a_true_surface_there_is_named() ->
 def test_the_worst_are_the_largest_false_reds_then_the_largest_over_estimates(tmp_path: Path) -> None:
     reds = [replace(RED, index=k, said_mm=-10.0 * k) for k in range(8)]
     overs = [replace(CLEAR, index=20 + k, over_mm=float(k)) for k in range(8)]
-    chosen = choose_worst([*reds, *overs])
-    assert [row.index for row in chosen] == [7, 6, 5, 4, 3, 27, 26, 25, 24, 23]
+    assert [row.index for row in choose_worst([*reds, *overs])] == [7, 6, 5, 4, 3, 27, 26, 25, 24, 23]
     folder = tmp_path / BATCH / "1-7" / "audit"
     folder.mkdir(parents=True)
     (folder / "worst_1.png").write_bytes(b"picture")

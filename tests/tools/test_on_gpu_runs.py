@@ -19,8 +19,7 @@ def test_a_recording_without_a_robot_is_reconstructed_where_there_is_no_pinocchi
     words = desk.reconstruct(str(views), "scene", "cuda", *FEW)
     code, _, err, seconds = desk.run(["tools.on_gpu_runs", "--timed", *words[1:]])
     assert code == 0, err
-    run = json.loads((tmp_path / "scene" / "run.json").read_text())
-    assert run["versions"]["pin"] == "0"
+    assert json.loads((tmp_path / "scene" / "run.json").read_text())["versions"]["pin"] == "0"
     parts = json.loads(err.splitlines()[-1])
     assert parts["iterations"] > 0 and parts["occupancy"] > 0
     assert sum(parts.values()) < seconds

@@ -190,8 +190,7 @@ def test_the_largest_number_of_an_older_file_is_looked_at_in_vain(tmp_path: Path
     path, header = tmp_path / "a.npz", {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 3]}
     last_seen, steps = np.array([[[num_steps, 0, 0xFF]]], np.uint8), {"step_stamps_ns": list(range(num_steps))}
     np.savez(path, header=np.array(json.dumps(header | steps)), last_seen=last_seen)
-    seen = read_seen(path)
-    stamps_ns, classes = seen.look(np.array([[0.0, 0.0, 0.1 * k] for k in range(3)]))
+    stamps_ns, classes = read_seen(path).look(np.array([[0.0, 0.0, 0.1 * k] for k in range(3)]))
     assert stamps_ns.tolist() == [num_steps - 1, -1, -1]
     assert classes.tolist() == [EvidenceClass.FREE, EvidenceClass.OUT_OF_VIEW, EvidenceClass.UNANSWERED]
     np.savez(path, header=np.array(json.dumps(header)), states=np.full((1, 1, 3), 2, np.uint8))

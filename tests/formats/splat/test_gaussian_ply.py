@@ -114,8 +114,7 @@ def test_what_is_written_reads_back_within_float32_and_then_bit_for_bit(tmp_path
 def test_opacities_of_exactly_0_and_1_are_finite_logits_and_read_back_exactly(tmp_path: Path) -> None:
     edges = np.array([0.0, 1.0, np.nextafter(np.float32(1), np.float32(0)), 1e-30], np.float32)
     write_ply(tmp_path / "a.ply", replace(splat_set(4), opacities=edges), {})
-    rows = np.frombuffer(parts_of(tmp_path / "a.ply")[1], DTYPE)
-    assert np.isfinite(rows["opacity"]).all()
+    assert np.isfinite(np.frombuffer(parts_of(tmp_path / "a.ply")[1], DTYPE)["opacity"]).all()
     back = read_ply(tmp_path / "a.ply")[0].opacities
     assert back[:3].tolist() == edges[:3].tolist() and back[3] == pytest.approx(1e-30, rel=1e-5)
 

@@ -110,8 +110,7 @@ def test_files_of_version_2_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("index", [0, 1, 2, 3])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_every_largest_component_and_sign_keeps_its_rotation(tmp_path: Path, index: int, sign: int) -> None:
-    rng = np.random.default_rng(index)
-    quats = rng.uniform(-0.9, 0.9, (200, 4))
+    quats = np.random.default_rng(index).uniform(-0.9, 0.9, (200, 4))
     quats[:, index] = sign
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     gaussians = replace(gaussian_set(200), quats_wxyz=quats.astype(np.float32))

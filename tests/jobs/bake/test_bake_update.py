@@ -40,8 +40,7 @@ def after(splats: SplatSet) -> SplatSet:
     centers = splats.centers.copy()
     nearest = int(np.argsort(np.linalg.norm(centers - centers[7], axis=1))[1])
     centers[nearest] += np.float32(0.004)
-    kept = np.arange(len(splats)) != 7
-    return replace(splats, centers=centers).select(kept)
+    return replace(splats, centers=centers).select(np.arange(len(splats)) != 7)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 import tomllib
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,20 +19,15 @@ from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 from tests.jobs.stage import Runs
 
-OLDER = Path(__file__).parents[2] / "data" / "older.zip"
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
 NEAR |= {"place": [1.0, 2.0, 3.0], "cause": "near splat 7", "remedy": "stop"}
 
 Edit = Callable[[dict[str, Any]], None]
 
 
-@pytest.fixture(scope="module")
-def audit(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A replay that an earlier version wrote."""
-    folder = tmp_path_factory.mktemp("older")
-    with zipfile.ZipFile(OLDER) as archive:
-        archive.extractall(folder)
-    return folder / "audit"
+@pytest.fixture
+def audit(older: Path) -> Path:
+    return older / "audit"
 
 
 def edited(source: Path, target: Path, **metrics: float | None) -> Path:
@@ -350,8 +344,7 @@ def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() 
     declared = judged_runs.scales()["replay"]
     for mode in ("audit", "open-loop", "closed-loop"):
         fields = ("exact", "barrier", "certified")
-        names = metric_scales(mode, fields, has_truth=True, has_twists=True)
-        assert set(names) <= set(declared)
+        assert set(metric_scales(mode, fields, has_truth=True, has_twists=True)) <= set(declared)
     assert declared["min_clearance"].better is Better.HIGHER
     assert declared["num_in_collision"].better is Better.LOWER
     assert all(scale.absolute >= 0 and scale.relative >= 0 for scale in declared.values())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.errors import UsageError, WriteError
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, read_ply, write_ply
 from splatctrl_cli.jobs.export import export as job
@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
 from tests.jobs.export.test_export_run import ball, written
+from tests.refused import expect_refusal
 
 
 @pytest.fixture
@@ -63,8 +64,7 @@ def test_a_colour_that_no_picture_has_is_the_fault_of_the_input(scene: Path, val
         gaussians.scales[:, 0] *= 2
         gaussians.harmonics[3, 0, 1] = value
         write_gaussian_ply(file, gaussians, {})
-    with pytest.raises(InputError, match="splat 3: colour: expected at most 10000"):
-        export(scene, "out.ply", isotropic=True)
+    expect_refusal("splat 3: colour: expected at most 10000", export, scene, "out.ply", isotropic=True)
     assert not (scene.parent / "out.ply").exists()
 
 
@@ -73,8 +73,7 @@ def test_a_file_that_renders_differently_is_not_left_behind(scene: Path, monkeyp
         write_ply(path, replace(splats, colors=splats.colors * np.float32(0.999)), comments)
 
     monkeypatch.setattr(job, "write_ply", write_darker)
-    with pytest.raises(WriteError, match=r"out.ply: differs from its source: color 0.000"):
-        export(scene, "out.ply")
+    expect_refusal(r"out.ply: differs from its source: color 0.000", export, scene, "out.ply", error=WriteError)
     assert not list(scene.parent.glob("out.ply*"))
 
 
@@ -89,8 +88,7 @@ def test_an_exact_format_whose_rendering_differs_is_not_left_behind(
         return seen if len(calls) % 2 else replace(seen, color=seen.color * np.float32(0.9995))
 
     monkeypatch.setattr(job, "render_splats", darker_every_second_time)
-    with pytest.raises(WriteError, match="does not render as its source: PSNR "):
-        export(scene, "out.glb")
+    expect_refusal("does not render as its source: PSNR ", export, scene, "out.glb", error=WriteError)
     assert not list(scene.parent.glob("out.*"))
 
 
@@ -161,11 +159,9 @@ def test_the_full_layout_has_the_62_properties_and_says_what_it_leaves_out(scene
 
 def test_anisotropic_gaussians_are_made_isotropic_on_request_alone(gaussians: Path) -> None:
     out = gaussians.parent / "out.ply"
-    with pytest.raises(UsageError, match="expected isotropic splats"):
-        export(gaussians, "out.ply", layout="short")
+    expect_refusal("expected isotropic splats", export, gaussians, "out.ply", layout="short", error=UsageError)
     export(gaussians, "out.ply")
-    with pytest.raises(InputError, match=r"got 400 of 400 whose scales differ; .*--isotropic"):
-        read_ply(out)
+    expect_refusal(r"got 400 of 400 whose scales differ; .*--isotropic", read_ply, out)
     result = export(gaussians, "out.ply", isotropic=True, force=True)
     assert result.was_rounded and result.isotropic_psnr is not None and 15 < result.isotropic_psnr < 60
     np.testing.assert_allclose(read_ply(out)[0].radii, 0.02 * 0.45 ** (1 / 3), rtol=1e-5)

@@ -46,7 +46,6 @@ def read_back(path: Path) -> Messages:
 def protobuf_topics(path: Path) -> list[str]:
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None
     return [channel.topic for channel in summary.channels.values() if channel.message_encoding == "protobuf"]
 
 
@@ -110,7 +109,6 @@ def test_every_link_is_where_the_robot_has_it_and_our_own_reader_reads_it_too(ru
 def test_known_space_is_a_grid_of_states_from_its_lower_corner(run: Runs, tmp_path: Path) -> None:
     spaces = logged(run())["/known_space"]
     grid = open_scene(tmp_path / "scene").snapshots[-1].occupancy()
-    assert grid is not None
     stamp, space = spaces[-1]
     states = grid.states(0.3, 0.7)
     shape = (len(space.data) // space.slice_stride, space.row_count, space.column_count)
@@ -124,8 +122,7 @@ def test_known_space_is_a_grid_of_states_from_its_lower_corner(run: Runs, tmp_pa
 def test_clearances_are_numbers_and_the_verdict_and_events_are_lines(run: Runs) -> None:
     folder = run()
     found = logged(folder)
-    last = found["/clearance"][-1][1]
-    assert last["exact"] == pytest.approx(0.012, abs=1e-4)
+    assert found["/clearance"][-1][1]["exact"] == pytest.approx(0.012, abs=1e-4)
     lines = [(message.level, message.message) for _, message in found["/events"]]
     assert lines[0] == (2, json.loads((folder / "run.json").read_text())["verdict"]["sentence"])
     assert any(level == 3 and text.startswith("below-margin: hand[4], worst 0.012 m") for level, text in lines)

@@ -32,8 +32,7 @@ BOX = (-0.4, -0.4, -0.4, 0.9, 0.4, 0.4)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    splats = splats_of(*BALLS)
-    people = replace(splats, labels=np.array([Label.OBJECT, Label.HUMAN], np.uint8))
+    people = replace(splats_of(*BALLS), labels=np.array([Label.OBJECT, Label.HUMAN], np.uint8))
     return write_scene(tmp_path / "scene", (START_NS, people))
 
 

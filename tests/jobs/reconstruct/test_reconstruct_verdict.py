@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config, OccupancyConfig
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, RecordingRequest, open_to_train
@@ -16,6 +16,7 @@ from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.records import LossReport, RecordSource, RgbdFrame
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep
 from tests.calibration.scan import views_of
+from tests.refused import expect_refusal
 
 TENTH = 100_000_000  # [ns]
 CAMERAS = ("cam0", "cam1")
@@ -213,8 +214,5 @@ def test_views_at_their_own_scale_pass(scan: RecordSource, views: list[RgbdFrame
 def test_depths_ten_times_too_far_or_near_are_refused_with_the_option_to_give(
     scan: RecordSource, views: list[RgbdFrame], factor: float
 ) -> None:
-    with pytest.raises(InputError) as refused:
-        check(scan, views, factor)
-    assert "--depth-scale" in (refused.value.remedy or "")
-    assert "--allow-disagreement" in (refused.value.remedy or "")
+    expect_refusal("; .*--depth-scale.*--allow-disagreement", check, scan, views, factor)
     check(scan, views, factor, is_allowed=True)

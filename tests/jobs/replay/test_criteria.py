@@ -159,8 +159,7 @@ def test_an_object_always_beside_a_link_that_hardly_moves_may_be_its_part(
     happened = replace(event(EventKind.BELOW_MARGIN), source="exact", worst_name="fore[1]", worst=0.009)
     columns = {"clearance_exact": distance, "clearance_splats": distance, "nearest_exact": ["fore[1]"] * NUM}
     known = SimpleNamespace(unknown=unknown)
-    run = judged(columns, events=(happened,), self_model=known, fields=("exact",))
-    (reason,) = clearance(run)
+    (reason,) = clearance(judged(columns, events=(happened,), self_model=known, fields=("exact",)))
     assert reason.outcome is outcome
     if outcome is Outcome.NOT_EVALUABLE:
         assert "a part of fore, which moves too little (3 of 5 configurations)" in reason.sentence
@@ -192,8 +191,7 @@ def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
 
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:
-    ages = np.array([0.1] * 10 + [1.5])
-    run = judged({"map_age_s": ages}, events=(event(EventKind.STALE_MAP),))
+    run = judged({"map_age_s": np.array([0.1] * 10 + [1.5])}, events=(event(EventKind.STALE_MAP),))
     assert outcomes(evidence.map_age, run) == [Outcome.NOT_EVALUABLE]
 
 
@@ -282,8 +280,7 @@ def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: Ev
 @pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
 def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
     share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
-    run = judged({column: share})
-    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+    assert outcomes(evidence.known_space, judged({column: share})).count(Outcome.NOT_EVALUABLE) == count
 
 
 @pytest.mark.parametrize(

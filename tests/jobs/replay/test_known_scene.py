@@ -157,8 +157,7 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     ball = trimesh.creation.icosphere(radius=0.02)
     base = arm.join_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
     model = base.join_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
-    center = (hand - [0.0, 0.0, 0.3])[None]
-    scene = BallDistance(of_points=away, centers=center, radii=np.array([0.01]))
+    scene = BallDistance(of_points=away, centers=(hand - [0.0, 0.0, 0.3])[None], radii=np.array([0.01]))
     fields = KnownFields(
         barrier=Away(),
         distances={"exact": scene, "barrier": scene},

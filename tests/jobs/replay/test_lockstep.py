@@ -63,8 +63,7 @@ def replayed(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) ->
             stamps.update({name: list(camera.stamps_ns) for name, camera in motion.cameras.items()})
             return estimated(model, logged, motion)
 
-        number = len(list(folder.iterdir()))
-        out, scene = folder / f"{number}", folder / f"scene_{every}"
+        out, scene = folder / f"{len(list(folder.iterdir()))}", folder / f"scene_{every}"
         every_set = ["--set", f"scene.snapshot_every={every}"]
         known = ["--lockstep", *every_set]
         if has_folder:
@@ -124,8 +123,7 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
         scene.at(first + round(seconds * SECOND))
         assert len(scene.stamps_ns) == num
     assert scene.age_s(first + SECOND // 2) == pytest.approx(0.3, abs=1e-6)
-    step = scene.step_at(first + round(0.66 * SECOND))
-    assert step.seconds == pytest.approx(0.2, abs=1e-3)
+    assert scene.step_at(first + round(0.66 * SECOND)).seconds == pytest.approx(0.2, abs=1e-3)
     scene.finish()
     assert {"splats.ply", "run.json", "snapshots.csv", "occupancy.npz"} <= {
         path.name for path in (tmp_path / "scene").iterdir()
@@ -160,8 +158,7 @@ def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
 ) -> None:
     memory = EmulatedDevice()
     cards(monkeypatch, memory)
-    scene = opened(small_recording, tmp_path, arm, latency=0.0, device="cuda")
-    scene.finish()
+    opened(small_recording, tmp_path, arm, latency=0.0, device="cuda").finish()
     assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0"]
     assert not memory.sizes  # given back
     with pytest.raises(UsageError, match="--device cuda: expected --lockstep"):

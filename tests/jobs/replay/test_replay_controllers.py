@@ -204,8 +204,7 @@ def test_the_examples_drive_alike(stage: Stage) -> None:
     assert code == 0 and float(python[-1]["position_error"]) < 0.01
     code, _ = stage.judged("--controller-command", "./reach", "--controller-twice", mode="closed-loop", scene=scene)
     assert code == 0
-    cpp = stage.desk.rows()
-    assert_same_commands(cpp, python)
+    assert_same_commands(stage.desk.rows(), python)
     stage.judged("--controller", "reach:Reach", mode="open-loop", scene=scene)
     python = stage.desk.rows()
     stage.judged("--controller-command", "./reach", mode="open-loop", scene=scene)
@@ -228,7 +227,6 @@ def goal(folder: Path, moved: list[str], *values: float) -> Float64:
     model = RobotModel.from_urdf(urdf, spheres).moved_by(moved)
     request = ReplayRequest(log=urdf, urdf=urdf, out=urdf, mode="closed-loop", goal_joints=values)
     (waypoint,) = goal_waypoints(request, model, "hand", END[: model.num_joints])
-    assert waypoint.posture is not None
     assert waypoint.T_world_goal.tolist() == model.frame_pose(waypoint.posture, "hand").tolist()
     return waypoint.posture
 

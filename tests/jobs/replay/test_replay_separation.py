@@ -129,8 +129,7 @@ def test_space_never_seen_counts_as_a_person_on_request(stage: Stage) -> None:
     stage.states, stage.last_seen = resting(), unseen_about(hand + np.array([0.0, 0.0, 0.6]), 0.2)
     for unseen, reach in (("ignored", np.inf), ("person", 0.6)):
         text = CELL.replace("[person]", f'[person]\nunseen = "{unseen}"')
-        scene = stage.scene(unseen)
-        stage.judged(*separation_option(stage, text), scene=scene)
+        stage.judged(*separation_option(stage, text), scene=stage.scene(unseen))
         assert np.all((column(stage, "separation") < reach) == (unseen == "person"))
 
 

@@ -114,11 +114,11 @@ def test_an_object_that_may_be_a_part_of_the_arm_does_not_fail_a_driven_motion(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_contact(stage)
-    scene = stage.scene()
-    assert stage.judged(scene=scene, mode="closed-loop")[0] == 1
+    scene, brief = stage.scene(), ("--set", "control.max_time=0.5")
+    assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 1
     found = ("fore", "moves too little (3 of 5 configurations)")
     monkeypatch.setattr("splatctrl_cli.jobs.replay.verdict.unlearned_link", lambda judged: found)
-    assert stage.judged(scene=scene, mode="closed-loop")[0] == 5
+    assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 5
     code, verdict = stage.judged(scene=scene)
     assert (code, verdict["label"]) == (1, "contact"), "of the logged motion only its own link's distance is in doubt"
 
@@ -148,8 +148,7 @@ def test_the_margin_is_kept_up_to_what_a_solver_leaves(stage: Stage, gap: float,
 
 @pytest.mark.parametrize(("gap", "label"), [(0.01, "margin broken"), (-0.01, "contact")])
 def test_the_truth_alone_turns_the_verdict(stage: Stage, gap: float, label: str) -> None:
-    truth = stage.truth(FAR, stage.ball_at_the_end(gap))
-    code, verdict = stage.judged("--truth", str(truth))
+    code, verdict = stage.judged("--truth", str(stage.truth(FAR, stage.ball_at_the_end(gap))))
     assert (code, verdict["label"], decisive(verdict)) == (1, label, {"true clearance": "failed"})
     assert verdict["reasons"][0]["value"] == pytest.approx(gap, abs=1e-5)
     assert "near ball1" in verdict["sentence"]
@@ -157,8 +156,7 @@ def test_the_truth_alone_turns_the_verdict(stage: Stage, gap: float, label: str)
 
 def test_contact_by_the_truth_is_contact_where_the_map_only_breaks_the_margin(stage: Stage) -> None:
     stage.balls = [FAR, stage.ball_at_the_end(0.01)]
-    truth = stage.truth(FAR, stage.ball_at_the_end(-0.01))
-    code, verdict = stage.judged("--truth", str(truth))
+    code, verdict = stage.judged("--truth", str(stage.truth(FAR, stage.ball_at_the_end(-0.01))))
     assert (code, verdict["label"]) == (1, "contact")
     assert verdict["sentence"].startswith("replay: CONTACT") and "true clearance: hand" in verdict["sentence"]
 

@@ -92,8 +92,7 @@ def test_an_arm_that_folds_into_itself_is_in_contact_whatever_its_spheres_are(
 def test_spheres_that_overlap_where_the_links_do_not_are_no_contact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spheres: SphereSet
 ) -> None:
-    desk = desk_of(tmp_path, monkeypatch, spheres, -OPEN, OPEN)
-    found = judged(desk)
+    found = judged(desk_of(tmp_path, monkeypatch, spheres, -OPEN, OPEN))
     assert (found["outcome"], found["value"]) == ("passed", pytest.approx(0.022, abs=1e-4))
 
 
@@ -240,10 +239,10 @@ def measured(model: RobotModel, urdf: Path, packages: Path) -> MeasuredRobot:
 
 
 def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONFIG) -> ReplayTrace:
-    """From where the README's closed loop starts to where its log ends."""
+    """From where the log is 3 s before its end to where it ends."""
     motion, frame = tabletop.arm_motion(7.0), model.frame_names[-1]
     goal = model.frame_pose(motion.at(7.0)[0], frame)
-    task = ReplayTask(start=motion.at(1.6)[0], T_world_goal=goal, frame=frame)
+    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=goal, frame=frame)
     return closed_loop(model, config, task, lambda _: field)
 
 
@@ -293,7 +292,6 @@ def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredR
 
 
 def nearest(robot: MeasuredRobot, q: Float64) -> float:
-    assert robot.surfaces is not None
     return float(robot.surfaces.gaps(q[None], robot.model.sphere_centers_batch(q[None]), 0.02).min())
 
 

@@ -87,7 +87,6 @@ def test_a_starved_budget_hides_nothing_that_arrives(sample_data: Path, tmp_path
     num_looked_at = 0
     for snapshot in (s for s in scene.snapshots if visitor["from_ns"] < s.stamp_ns < visitor["to_ns"]):
         grid, bare, splats = snapshot.occupancy(), snapshot.unrepresented(), snapshot.splats()
-        assert grid is not None and bare is not None
         there = occupied_in(visitor, grid)
         num_looked_at += len(there) > 50
         others = splats.select(splats.labels != Label.ROBOT)
@@ -114,8 +113,7 @@ def occupied_in(visitor: dict[str, Any], grid: OccupancyGrid) -> Float64:
 def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> None:
     old = write_scene(tmp_path / "old", (0, splats_of(((0.0, 0.0, 0.0), 0.05))))
     (old / "snapshots" / "000000.npz").unlink()
-    distances = read_splat_scene(old, Config(), 1).at(0).distances["exact"](POINTS)
-    assert distances[0] > 0.6
+    assert read_splat_scene(old, Config(), 1).at(0).distances["exact"](POINTS)[0] > 0.6
 
 
 @pytest.mark.parametrize(("human_margin", "code"), [(0.055, 0), (0.065, 1)])

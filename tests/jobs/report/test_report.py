@@ -51,8 +51,6 @@ def test_a_report_says_the_verdict_first_and_holds_everything_itself(run: Runs) 
 
 def test_the_scene_of_a_replay_is_the_one_known_at_each_time(run: Runs, arm: RobotModel) -> None:
     space = space_of(run())
-    assert space.motion is not None
-    assert space.deciding is not None
     assert list(map(len, space.splats.values())) == [1, 1, 2, 2, 2]
     assert list(space.splats) == [0.0, 0.25, 0.5, 0.75, 1.0]
     worst = int(np.argmin(space.motion.clearance))
@@ -104,7 +102,6 @@ def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> No
     found = found_on(folder.with_name("page.html"), script)
     assert found["complaints"] == []
     motion = space_of(folder).motion
-    assert motion is not None
     for shown, poses in ((found["first"], motion.poses[0]), (found["last"], motion.poses[-1])):
         drawn = [transform_from(link[:3], link[3:]) for link in shown]
         np.testing.assert_allclose(drawn, poses, atol=2e-4)
@@ -116,8 +113,7 @@ def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> No
 
 def test_a_click_in_the_timeline_moves_the_arm_and_the_pointer_reads_values(run: Runs) -> None:
     folder = run(mode="closed-loop")
-    page = reported(folder)
-    assert "QP rung" in page
+    assert "QP rung" in reported(folder)
     script = f"""{OPENED}
       const line = document.querySelector(".timeline"), box = line.getBoundingClientRect();
       const at = {{clientX: box.left + 0.5 * box.width, clientY: box.top + 50, bubbles: true}};
@@ -173,8 +169,7 @@ def test_what_is_no_whole_run_is_refused(run: Runs, break_it: Callable[[Path], N
 
 def test_a_report_is_not_replaced_without_force_and_a_run_without_anything_to_see_is_refused(run: Runs) -> None:
     folder = run()
-    made = write_report(WriteReportRequest(path=folder))
-    assert made.file == folder.with_name("audit.html")
+    assert write_report(WriteReportRequest(path=folder)).file == folder.with_name("audit.html")
     expect_refusal("already exists", write_report, WriteReportRequest(path=folder), error=UsageError)
     patch_json(folder / "run.json", lambda found: found | {"command": "score"})
     expect_refusal("score leaves nothing to see", view, ViewRequest(path=folder))

@@ -99,8 +99,7 @@ def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str)
         topic = "/left/robot_description" if kind == "namespace" else "/robot_description"
         message = as_parameter(robot()) if kind == "parameter" else described(robot(), topic)
         path = log_with(tmp_path / "run.mcap", message)
-    found = logged_urdf([path])
-    assert found.text == robot()
+    assert logged_urdf([path]).text == robot()
     request = ReplayRequest(log=path, out=tmp_path / "out")
     assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
 
@@ -192,8 +191,7 @@ def test_a_reconstruction_leaves_the_robot_of_the_log_out_where_it_can(
 ) -> None:
     path, said = log_with(tmp_path / "run.mcap", described(text), **recipe), Said()
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "scene", recording=path)
-    model = _robot(request, said)
-    assert (model is None) == bool(words)
+    assert (_robot(request, said) is None) == bool(words)
     start = "warning: the robot stays in the map: " if words else f"the robot is the log's own: {path}/robot_desc"
     assert said.lines[0].startswith(start) and words in said.lines[0]
 
@@ -202,8 +200,7 @@ def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path)
     spheres = written(tmp_path, "collision_spheres:\n  tip:\n  - center: [0, 0, 0]\n    radius: 0.1\n", "s.yaml")
     path = log_with(tmp_path / "run.mcap", described(robot(shape=MESH)))
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
-    model = _robot(request, Said())
-    assert model.sphere_set.links == ("tip",)
+    assert _robot(request, Said()).sphere_set.links == ("tip",)
     other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
     with pytest.raises(InputError, match=r"give --world-frame base, or --urdf where both frames are one"):
         _robot(replace(request, source=open_source(other), recording=other), Said())
@@ -241,7 +238,6 @@ def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture"))[0]
     assert is_capture(capture)
     assert (capture / "robot_description.urdf").read_text() == robot()
-    found = logged_urdf([capture])
-    assert found.text == robot()
+    assert logged_urdf([capture]).text == robot()
     (capture / "robot_description.urdf").write_text(robot(shift=0.3))
     expect_refusal("its checksum differs from SHA256SUMS", logged_urdf, [capture])

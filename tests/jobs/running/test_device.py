@@ -12,7 +12,6 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake import request as bake_request
 from splatctrl_cli.jobs.query import query
 from splatctrl_cli.jobs.running import device
@@ -22,7 +21,7 @@ from splatctrl_cli.kernels.cuda.driver import Card
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Memory
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.cli.test_reconstruct import contents, write_folder
-from tests.field.scenes import cloud, queries, splat_set
+from tests.field.scenes import queries
 from tests.jobs.stage import failing
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.test_driver import FakeDriver
@@ -136,8 +135,7 @@ def test_a_run_that_one_device_began_goes_on_on_the_other(
 def test_a_card_that_is_lost_ends_the_run_by_name_and_it_goes_on_elsewhere(
     views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lost = Fails(15, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS"))
-    cards(monkeypatch, lost)
+    cards(monkeypatch, Fails(15, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS")))
     assert reconstruct(views, tmp_path / "scene", "--device", "cuda", "-q") == 70
     (line,) = capsys.readouterr().err.splitlines()
     assert "cuda:0 (Card, driver 580.1): CUDA_ERROR_ILLEGAL_ADDRESS; " in line
@@ -209,8 +207,7 @@ def test_auto_goes_on_where_the_run_was(
             monkeypatch.setattr(device, "open_device", no_card)
         capsys.readouterr()
         assert reconstruct(views, tmp_path / name, "--resume") == 0
-        found = run_of(tmp_path / name)["metrics"]["devices"]
-        assert [each["device"] for each in found] == ends
+        assert [each["device"] for each in run_of(tmp_path / name)["metrics"]["devices"]] == ends
         assert ("computes on cpu: no NVIDIA driver" in capsys.readouterr().err) == (not has_card)
 
 
@@ -262,14 +259,6 @@ except Exception as error:
 
 BAKE = ("--box=-0.2,-0.15,-0.1,0.15,0.2,0.14", "--voxel", "0.02", "--formats", "npz", "--no-report")
 NAME = "cuda:0 (Card, driver 580.1)"
-
-
-@pytest.fixture(scope="module")
-def splats(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("splats") / "splats.ply"
-    centers, radii = cloud(300)
-    write_ply(path, splat_set(centers, np.maximum(radii, 0.002)), {})
-    return path
 
 
 @pytest.fixture(scope="module")

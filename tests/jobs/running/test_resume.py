@@ -35,14 +35,6 @@ FAST = [
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.2", "--width", "64", "--height", "48", "-q"]
-    assert main(["simulate", "-o", str(folder), *size]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
 def whole(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """What a run that is left alone gives, by input."""
     found = {}

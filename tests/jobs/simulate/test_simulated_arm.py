@@ -142,8 +142,7 @@ def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(
     arm: Path, simulated: Path, tmp_path: Path, suffix: str
 ) -> None:
     """The forearm's visual mesh is a rod of 3 cm inside of its collision mesh."""
-    packages = shutil.copytree(arm.parents[1], tmp_path / "packages")
-    (urdf,) = packages.rglob("my_arm.urdf")
+    (urdf,) = shutil.copytree(arm.parents[1], tmp_path / "packages").rglob("my_arm.urdf")
     rod = trimesh.creation.capsule(height=0.2, radius=0.03, count=[16, 16])
     rod.apply_translation([0.0, 0.01, -0.22])
     if suffix == "dae":

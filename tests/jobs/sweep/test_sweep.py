@@ -44,7 +44,6 @@ def told(run: Path) -> list[str]:
 def test_a_margin_flips_where_the_log_says_and_both_runs_are_kept_as_folders(tmp_path: Path) -> None:
     run = run_of(tmp_path, failed={"margin": [[0.0437, 9]]})
     flip = swept(run, "margin=0.02:0.1", tolerance=0.01).flips[0]
-    assert flip.last is not None and flip.first is not None
     assert flip.last.values["margin"] < 0.0437 <= flip.first.values["margin"] <= flip.last.values["margin"] + 0.0008
     assert flip.sentence.startswith("margin: SAFE up to 0.0")
     folders = [read_judged(tmp_path / "sweep" / each.folder) for each in (flip.last, flip.first)]
@@ -139,16 +138,13 @@ def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
     ],
 )
 def test_a_range_that_is_none_is_refused_before_any_run(tmp_path: Path, over: str, words: str) -> None:
-    run = run_of(tmp_path)
-    with pytest.raises(UsageError) as refused:
-        swept(run, over)
-    assert words in str(refused.value)
+    expect_refusal(words, swept, run_of(tmp_path), over, error=UsageError)
     assert not (tmp_path / "sweep").exists()
 
 
 def test_a_run_that_is_not_evaluable_has_nothing_to_flip(tmp_path: Path) -> None:
-    with pytest.raises(NotEvaluableError, match="there is no verdict to flip"):
-        swept(run_of(tmp_path / "a", outcome="not evaluable"), "margin=0.02:0.1")
+    run = run_of(tmp_path / "a", outcome="not evaluable")
+    expect_refusal("there is no verdict to flip", swept, run, "margin=0.02:0.1", error=NotEvaluableError)
     lacking = run_of(tmp_path / "b", lacking={"latency": [[0, 1]]})
     expect_refusal(r"latency=0\.5: there is no verdict", swept, lacking, "latency=0.5:2", error=NotEvaluableError)
 

@@ -170,8 +170,6 @@ def bisected(judge: Callable[[float], str], low: float, high: float, tolerance: 
 def test_a_flip_is_told_to_the_tolerance_from_either_side(start: float, end: float, is_monotone: bool) -> None:
     judge = Counted((0.4371, 9.0))
     found = find_flip(judge, start, end, tolerance=0.001, is_monotone=is_monotone)
-    assert found.last is not None
-    assert found.first is not None
     assert found.is_monotone
     assert min(found.last, found.first) < 0.4371 <= max(found.last, found.first)
     assert 0 < abs(found.first - found.last) <= 0.001 * (1 + 1e-9)
@@ -235,9 +233,7 @@ def beyond(*slope: float) -> Callable[[Sequence[Sequence[float]]], list[str]]:
 def test_the_least_change_of_several_is_near_that_of_a_plane(slope: tuple[float, ...]) -> None:
     alone = [1.0 / each if each >= 1.0 else None for each in slope]
     found = find_least(beyond(*slope), alone, tolerance=0.005)
-    assert found is not None
-    foot = np.array(slope) / np.dot(slope, slope)
-    assert found.length <= 1.06 * np.linalg.norm(foot) + 0.005
+    assert found.length <= 1.06 * np.linalg.norm(np.array(slope) / np.dot(slope, slope)) + 0.005
     assert found.length == pytest.approx(math.hypot(*found.first), rel=1e-4)
     assert beyond(*slope)([found.last, found.first]) == ["passed", "failed"]
     assert all(0.0 <= share <= 1.0 for share in found.first)
@@ -245,11 +241,9 @@ def test_the_least_change_of_several_is_near_that_of_a_plane(slope: tuple[float,
 
 
 def test_what_only_all_together_flip_is_found_at_the_corner() -> None:
-    found = find_least(beyond(0.51, 0.51), [None, None], tolerance=0.01)
-    assert min(found.first) > 0.9
+    assert min(find_least(beyond(0.51, 0.51), [None, None], tolerance=0.01).first) > 0.9
     assert find_least(beyond(0.4, 0.4), [None, None], tolerance=0.01) is None
 
 
 def test_a_flip_of_one_value_alone_stands_where_nothing_is_nearer() -> None:
-    found = find_least(beyond(4.0, 0.0), [0.25, None], tolerance=0.01)
-    assert found.first == (0.25, 0.0)
+    assert find_least(beyond(4.0, 0.0), [0.25, None], tolerance=0.01).first == (0.25, 0.0)

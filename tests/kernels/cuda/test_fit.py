@@ -115,8 +115,7 @@ def test_loss_and_its_derivative_equal_those_of_the_processor(case: str, device:
 @pytest.mark.parametrize("scene", ["small", "opaque", "huge"])
 def test_gradients_equal_those_of_the_processor(scene: str, device: Memory) -> None:
     p = SCENES[scene]
-    fit = fitted(device, p)
-    gradients, _ = fit.gradients(0, WEIGHTS, SETTINGS)
+    gradients, _ = fitted(device, p).gradients(0, WEIGHTS, SETTINGS)
     want_planes, _ = OnProcessor(p, camera()).loss(target(), WEIGHTS)
     want = OnProcessor(p, camera()).gradients(want_planes, SETTINGS.regulariser)
     assert [error(gradients[:, k], want[:, k]) < BACKWARD for k in range(8)] == [True] * 8
@@ -240,7 +239,6 @@ def test_what_does_not_fit_is_refused_with_the_budget_that_does() -> None:
     with pytest.raises(OutOfMemory, match=r"50000 splats and 4 views take .* MB, 60 MB are free") as caught:
         fit.expect(sizes)
     said = re.fullmatch(r"a budget of (\d+) splats would fit", caught.value.remedy)
-    assert said is not None
     fit.close()
     small = DeviceFit(fit.device, int(said[1]))
     small.expect(sizes)

@@ -108,8 +108,7 @@ def test_a_damaged_image_is_left_out_and_counted(tmp_path: Path) -> None:
     image.write_bytes(image.read_bytes()[:-4])
     (folder / "color/cam0/000004.jpg").unlink()
     source = open_source(folder)
-    after = list(source.records())
-    assert len(after) == len(before) - 2
+    assert len(list(source.records())) == len(before) - 2
     assert source.loss.damaged == 2
     next(source.records())
     assert source.loss.damaged == 2, "a second pass that ends early forgets nothing"

@@ -74,8 +74,7 @@ def descriptor_set() -> bytes:
 
 def encoded(type_name: str, message: dict[str, Any]) -> bytes:
     """A message in the wire format."""
-    kind = type(read_protobuf(descriptor_set(), type_name, b""))
-    return bytes(kind(**message).SerializeToString())
+    return bytes(type(read_protobuf(descriptor_set(), type_name, b""))(**message).SerializeToString())
 
 
 def foxglove_of(kind: str, message: Any) -> tuple[str, dict[str, Any]]:

@@ -167,8 +167,7 @@ def test_what_was_written_is_read_and_cut_anywhere_a_part_of_it(
         path = tmp_path_factory.getbasetemp() / f"{name}.log"
         WRITERS[name](path, messages)
         assert found_in(path) == (messages, 0)
-        of_topic = [message for message in messages if message[0] == "/a"]
-        assert found_in(path, {"/a"}) == (of_topic, 0)
+        assert found_in(path, {"/a"}) == ([message for message in messages if message[0] == "/a"], 0)
         assert {topic.name for topic in open_raw_log(path).topics()} >= {message[0] for message in messages}
         data = path.read_bytes()
         path.write_bytes(data[: 16 + int(share * (len(data) - 17))])

@@ -62,11 +62,7 @@ def first_stored(path: Path, options: SourceOptions) -> tuple[tuple[str, ...], S
     return source.cameras, next(item for item in source.stored() if isinstance(item, StoredFrame))
 
 
-def ids(recording: Recording) -> str:
-    return f"{recording.path}{' by its example' if recording.example else ''}"
-
-
-@pytest.mark.parametrize("recording", RECORDINGS, ids=ids)
+@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda r: r.path + " by its example" * bool(r.example))
 def test_a_recording_is_read(real_data: Path, recording: Recording) -> None:
     path, options = real_data / recording.path, recording.options
     if recording.example:

@@ -191,8 +191,7 @@ def make_sun3d(folder: Path) -> Path:
     (folder / "extrinsics").mkdir()
     (folder / "extrinsics/20140101000000.txt").write_text("\n".join(rows[3:] + rows[:3]))
     (folder / "extrinsics/20150101000000.txt").write_text("\n".join(rows))
-    lens = f"{K[0]} 0 {K[2] + 1}\n0 {K[1]} {K[3] + 1}\n0 0 1\n"
-    (folder / "intrinsics.txt").write_text(lens)
+    (folder / "intrinsics.txt").write_text(f"{K[0]} 0 {K[2] + 1}\n0 {K[1]} {K[3] + 1}\n0 0 1\n")
     return folder
 
 

@@ -73,8 +73,7 @@ def test_a_damaged_text_of_a_layout_is_refused_in_one_line_or_read_around(
         folder = make(tmp_path / f"freiburg3_{number}")
         (folder / name).write_bytes(content)
         try:
-            source = open_source(folder, SourceOptions())
-            list(source.records())
+            list(open_source(folder, SourceOptions()).records())
         except InputError as error:
             assert "\n" not in str(error) and error.remedy
 
@@ -92,8 +91,7 @@ def test_the_camera_of_a_tum_folder_is_known_by_its_name(tmp_path: Path) -> None
 def test_tum_images_without_partner_or_pose_are_counted(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "freiburg3")
     for name, kept in (("depth.txt", slice(1, None)), ("groundtruth.txt", slice(5))):
-        lines = (folder / name).read_text().splitlines(keepends=True)
-        (folder / name).write_text("".join(lines[kept]))
+        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[kept]))
     source = open_source(folder, GIVEN)
     assert len(list(source.records())) == 1
     assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == (1, 0, 1)

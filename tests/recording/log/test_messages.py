@@ -77,8 +77,7 @@ def test_compressed_color_keeps_its_bytes_and_is_refused_where_it_is_cut(suffix:
 def mosaic(rgb: tuple[int, int, int], pattern: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """8x8 pixels of one colour, of which each tells only one channel."""
     values = dict(zip("RGB", rgb, strict=True))
-    first = [values[letter] for letter in pattern]
-    return np.tile(np.array(first, np.uint8).reshape(2, 2), (4, 4))
+    return np.tile(np.array([values[letter] for letter in pattern], np.uint8).reshape(2, 2), (4, 4))
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GBRG", "GRBG"])
@@ -204,8 +203,7 @@ def test_colour_png_of_sixteen_bits_or_with_alpha_keeps_bytes_that_decode_alike(
 
 def with_orientation(jpeg: bytes) -> bytes:
     """With an EXIF segment that says: turn by 90 degrees (6)."""
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
-    tiff = b"II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
+    tiff = b"II*\x00" + struct.pack("<IH", 8, 1) + struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0) + bytes(4)
     exif = b"Exif\x00\x00" + tiff
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
 
@@ -214,10 +212,8 @@ def with_orientation(jpeg: bytes) -> bytes:
 def test_a_turned_camera_keeps_the_pixels_that_its_lens_is_of(color: bool) -> None:
     """OpenCV alone would turn the image, and with it leave the intrinsics behind."""
     jpeg = with_orientation(bytes(cv2.imencode(".jpg", RGB)[1]))
-    turned = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert turned.shape == (6, 4, 3)
-    pixels = decode_file(jpeg, color=color)
-    assert pixels.shape == (4, 6, 3)
+    assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (6, 4, 3)
+    assert decode_file(jpeg, color=color).shape == (4, 6, 3)
 
 
 def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_memory_is_taken(

@@ -125,11 +125,9 @@ def test_the_depth_cameras_own_lens_is_undone_before_its_depth_is_registered() -
     row, column = np.rint(LARGE.fy * y * factor + LARGE.cy), np.rint(LARGE.fx * x * factor + LARGE.cx)
     bent[row.astype(int), column.astype(int)] = 1.0
     warp = Lens(intrinsics=LARGE, depth_lens=own, T_color_depth=np.eye(4))
-    found = np.nonzero(warp.depth(bent))[1]
-    assert np.abs(found - (LARGE.fx * x + LARGE.cx)).max() <= 1.0
+    assert np.abs(np.nonzero(warp.depth(bent))[1] - (LARGE.fx * x + LARGE.cx)).max() <= 1.0
 
 
 def warped(depth: np.ndarray[Any, Any], color: Intrinsics = SMALL, **shift: float) -> np.ndarray[Any, Any]:
     """Depth of the small camera in a colour camera that is moved along x and z [m]."""
-    T_color_depth = pose_at([shift.get("x", 0.0), 0, shift.get("z", 0.0)])
-    return warp_depth(depth, SMALL, color, T_color_depth)
+    return warp_depth(depth, SMALL, color, pose_at([shift.get("x", 0.0), 0, shift.get("z", 0.0)]))

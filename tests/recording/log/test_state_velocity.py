@@ -18,8 +18,7 @@ def regular(num: int, period_ms: float = 10.0) -> np.ndarray[tuple[int], np.dtyp
 
 
 def test_the_derivative_of_a_parabola_is_exact_at_uneven_steps() -> None:
-    rng = np.random.default_rng(1)
-    stamps = START_NS + np.cumsum(rng.integers(4, 30, 60)) * MS
+    stamps = START_NS + np.cumsum(np.random.default_rng(1).integers(4, 30, 60)) * MS
     t = (stamps - stamps[0]) * 1e-9
     position = np.stack([1 + 2 * t + 3 * t**2, -t], axis=1)
     assert differentiate(stamps, position) == pytest.approx(np.stack([2 + 6 * t, -np.ones(60)], axis=1), abs=1e-6)
@@ -58,8 +57,7 @@ def track(position: np.ndarray[tuple[int, int], np.dtype[np.float64]], velocity:
 def test_a_velocity_of_zero_is_believed_of_a_joint_that_stands_still_only() -> None:
     position = np.stack([np.arange(50) * 0.01, np.full(50, 0.3)], axis=1)
     loss = LossReport()
-    states = clean_states(track(position, 0.0), loss)
-    assert states[20].velocity == pytest.approx([1.0, 0.0])
+    assert clean_states(track(position, 0.0), loss)[20].velocity == pytest.approx([1.0, 0.0])
     assert loss.differentiated_velocities == 50
     assert loss.notes == [
         "log: velocities of a are zero throughout although they move; they are differences of the positions"

@@ -78,8 +78,7 @@ def test_outside_the_recorded_time_nothing_is_known_beyond_the_tolerance() -> No
     tree, near = moving_tree(), {"tolerance_ns": 20_000_000}
     assert tree.lookup("world", "camera", 1_030_000_000, **near) is None
     assert tree.lookup("world", "camera", -30_000_000, **near) is None
-    late = tree.lookup("world", "camera", 1_010_000_000, **near)
-    assert late[:3, 3] == pytest.approx([1.0, 0, 0.5])
+    assert tree.lookup("world", "camera", 1_010_000_000, **near)[:3, 3] == pytest.approx([1.0, 0, 0.5])
 
 
 def test_a_long_gap_is_bridged_only_where_nothing_moved() -> None:
@@ -159,8 +158,7 @@ def test_a_transform_that_would_close_a_loop_or_is_a_second_parent_is_left_out_a
 ) -> None:
     tree = moving_tree()
     tree.add(parent, child, 0, np.array([9.0, 9, 9]), IDENTITY, static=True)
-    T = tree.lookup("world", "camera", 0)
-    assert T[:3, 3] == pytest.approx([0, 0, 0.5])
+    assert tree.lookup("world", "camera", 0)[:3, 3] == pytest.approx([0, 0, 0.5])
     assert "world" in tree.roots and tree.connects("world", "camera")
     assert said in tree.notes[0]
 

@@ -260,8 +260,7 @@ def test_nan_positions_are_damage_and_nan_velocities_are_differences(tmp_path: P
     q, v = ramp(30), np.full((30, 2), [1.0, 2.0])
     q[4, 1], v[9, 0] = np.nan, np.nan
     source = opened(write_mcap(tmp_path / "x.mcap", states_of(q, AB, velocity=v)))
-    velocity = columns(source, AB)[1]
-    assert velocity == pytest.approx(np.full((29, 2), [1.0, 2.0]))
+    assert columns(source, AB)[1] == pytest.approx(np.full((29, 2), [1.0, 2.0]))
     assert (source.loss.damaged, source.loss.differentiated_velocities) == (1, 1)
     assert any("velocities of a are missing or NaN in 1 states" in note for note in source.loss.notes)
     alone = opened(write_mcap(tmp_path / "y.mcap", states_of(ramp(1), AB)))
