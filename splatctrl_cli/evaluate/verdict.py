@@ -74,13 +74,14 @@ def passed_reason(sentence: str, value: float, threshold: float, unit: str, coun
 class Criterion(Generic[E]):
     """One criterion of a verdict.
 
-    find: its reasons, if it applies; its docstring's first paragraph enters the documentation's table. broken: that
-    table's cell on a violation.
+    find: its reasons, if it applies. asked: the documentation's words, by default the first paragraph of its
+    docstring. broken: those on a violation.
     """
 
     name: str
     find: Callable[[E], Iterable[Reason]]
     broken: str
+    asked: str = ""
 
     def reasons(self, found: E) -> Iterator[Reason]:
         return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
@@ -88,7 +89,8 @@ class Criterion(Generic[E]):
     @property
     def docs(self) -> str:
         """The table's row, its cells separated by |."""
-        asked = " ".join((inspect.getdoc(self.find) or "").split("\n\n")[0].split()).removesuffix(".")
+        words = self.asked or (inspect.getdoc(self.find) or "").split("\n\n")[0]
+        asked = " ".join(words.split()).removesuffix(".")
         return f"{self.name} | {asked[0].lower()}{asked[1:]} | {self.broken}"
 
 
