@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
@@ -48,7 +49,9 @@ def test_the_page_lists_every_job_with_its_request_and_result() -> None:
     rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
     kinds = {name: name.title().replace("_", "") for name in api.__all__}
     jobs = {name for name, kind in kinds.items() if f"{kind}Request" in api.__all__}
-    assert rows == [(job, f"{kinds[job]}Request", f"{kinds[job]}Result") for job, *_ in rows]
+    results = {name: result.__name__ for name in jobs if (result := get_type_hints(getattr(api, name))["return"])}
+    assert rows == [(job, f"{kinds[job]}Request", results[job]) for job, *_ in rows]
+    assert {*results.values()} <= {*api.__all__}
     assert {job for job, *_ in rows} == jobs
 
 
@@ -63,20 +66,10 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
         exec(compile(example, PAGE.name, "exec"), scope)
     names = ("made", "baked", "answered", "exported", "scored", "found", "since")
     made, baked, answered, exported, scored, found, since = (scope[name] for name in names)
-    kinds = (
-        api.ReconstructResult,
-        api.BakeResult,
-        api.QueryResult,
-        api.ExportResult,
-        api.ScoreResult,
-        api.ReplayResult,
-    )
-    assert all(map(isinstance, (made, baked, answered, exported, scored, found), kinds))
-    assert isinstance(since, api.CompareResult)
+    assert all(isinstance(each, api.JudgedResult) for each in (made, baked, scored, found, since))
+    assert all(isinstance(scope[name], api.Result) for name in ("answered", "exported", "logged", "told", "seen"))
+    assert isinstance(found, api.ReplayResult) and isinstance(since, api.CompareResult)
     assert (since.verdict.label, since.figures, dict(since.differences)) == ("no regression", (), {})
-    assert isinstance(scope["logged"], api.ExportRunResult)
-    assert isinstance(scope["told"], api.WriteReportResult)
-    assert isinstance(scope["seen"], api.ViewResult)
     assert answered.metrics["num_answered"] == 2  # type: ignore[attr-defined]
     for result in (made, baked, answered, exported, scored, found, since):
         verdict = getattr(result, "verdict", None)

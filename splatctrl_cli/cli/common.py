@@ -16,7 +16,7 @@ from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
 from splatctrl_cli.errors import UsageError, refuse_if
-from splatctrl_cli.evaluate.verdict import Verdict, gate
+from splatctrl_cli.evaluate.verdict import JudgedResult, Result, Verdict, gate
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics
 
@@ -352,6 +352,15 @@ class Console:
             for line in lines:
                 print(line)
         return code
+
+    def show(
+        self, result: Result, lines: Iterable[str], *, code: int | None = None, has_findings: bool = False
+    ) -> int:
+        """Print a job's verdict, if it has one, and its document or `lines`; return the exit code."""
+        document = result.document or {"out": result.out, **result.metrics}
+        if isinstance(result, JudgedResult):
+            return self.concluded(result.verdict, document, lines, code=code, has_findings=has_findings)
+        return self.result(document, lines)
 
     def concluded(
         self,

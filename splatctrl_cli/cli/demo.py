@@ -44,7 +44,7 @@ def run_simulate(args: argparse.Namespace, console: Console) -> int:
         (
             camera.name,
             "training" if camera.is_training else "scoring",
-            result.num_frames[camera.name],
+            result.metrics["frames"][camera.name],
             f"{camera.intrinsics.width}x{camera.intrinsics.height}",
             f"{truth.luminance_std[camera.name]:.3f}",
         )
@@ -53,10 +53,10 @@ def run_simulate(args: argparse.Namespace, console: Console) -> int:
     lines = [
         f"{result.out}",
         "",
-        *table(("file", "bytes"), list(result.sizes.items())),
+        *table(("file", "bytes"), list(result.document["bytes"].items())),
         "",
         *table(("camera", "role", "frames", "size", "luminance std"), cells),
         "",
         f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm",
     ]
-    return console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, lines)
+    return console.show(result, lines)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError, UsageError, WriteError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import Verdict, brief, lacking, read_verdict, verdict_of, worst
+from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, lacking, read_verdict, verdict_of, worst
 from splatctrl_cli.files.output import (
     Stopwatch,
     recorded_as,
@@ -78,18 +78,6 @@ class AuditRequest(RunOptions):
     words: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class AuditResult:
-    """The folder, its page and verdict; made: the steps that this call made."""
-
-    __repr__ = brief
-
-    out: Path
-    page: Path
-    verdict: Verdict
-    made: tuple[str, ...]
-
-
 @dataclass(kw_only=True)
 class _Steps:
     """The steps in `folder`; done: what made each one, and the digest of its file, by name."""
@@ -116,10 +104,11 @@ class _Steps:
         write_durably(self.folder / STEPS, lambda partial: write_json(partial, self.done))
 
 
-def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
+def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
     """Check, reconstruct, replay and write the page; leave out what the same inputs made before.
 
-    A log without joint states is not evaluable: its check and map stand alone. Raises UsageError for an unknown
+    A log without joint states is not evaluable: its check and map stand alone. Document: the page, and the steps
+    that this call made. Raises UsageError for an unknown
     robot, WriteError for an unwritable page, and what the steps raise.
     """
     source = open_source(request.log, request.options)
@@ -160,8 +149,8 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         seed=seed,
         verdict=verdict.as_dict(),
     )
-    made = tuple(steps.stopwatch.seconds)
-    return AuditResult(out=request.out, page=request.out / PAGE, verdict=verdict, made=made)
+    document = {"out": request.out, "page": request.out / PAGE, "made": [*steps.stopwatch.seconds]}
+    return JudgedResult(out=request.out, document=document, verdict=verdict)
 
 
 def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:

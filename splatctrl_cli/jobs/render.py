@@ -15,6 +15,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if, require
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import Stopwatch, output_path, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.geometry import interpolate_transform, transform_from
@@ -53,16 +54,6 @@ class RenderSceneRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderSceneResult:
-    """Number of pictures in `out`, and their size [px]."""
-
-    out: Path
-    num_pictures: int
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Track:
     """Poses T_world_camera (K, 4, 4) at ascending times (K,) [s]."""
 
@@ -78,8 +69,11 @@ class _Track:
         return interpolate_transform(self.poses[after - 1], self.poses[after], (time_s - start) / (end - start))
 
 
-def render_scene(request: RenderSceneRequest) -> RenderSceneResult:
-    """Render and write. Raises UsageError for an unknown camera, InputError for a bad path."""
+def render_scene(request: RenderSceneRequest) -> Result:
+    """Render and write; metrics: num_pictures, width and height [px].
+
+    Raises UsageError for an unknown camera, InputError for a bad path.
+    """
     scene, kind = open_scene(request.scene), request.out.suffix
     refuse_if(
         kind not in (PNG, MP4, ""),
@@ -105,7 +99,8 @@ def render_scene(request: RenderSceneRequest) -> RenderSceneResult:
             for number, image in enumerate(images):
                 (partial / f"{number:05d}{PNG}").write_bytes(_encode(image))
             write_run(partial, command="render", config={}, inputs={}, metrics={}, stopwatch=Stopwatch())
-    return RenderSceneResult(out=request.out, num_pictures=len(times), width=lens.width, height=lens.height)
+    metrics = {"num_pictures": len(times), "width": lens.width, "height": lens.height}
+    return Result(out=request.out, metrics=metrics)
 
 
 def _camera(request: RenderSceneRequest, scene: SceneFolder) -> tuple[Intrinsics, _Track]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import DAMAGED, UsageError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, plural, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Outcome, Reason, Verdict, plural, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
@@ -51,8 +51,8 @@ class BatchRequest:
     again: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class BatchResult(JudgedResult):
     """Runs of all nodes in graph order; num_kept of them from before."""
 
     out: Path
@@ -60,7 +60,6 @@ class BatchResult:
     jobs: Sequence[str]
     runs: Sequence[Run]
     num_kept: int
-    verdict: Verdict
 
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:

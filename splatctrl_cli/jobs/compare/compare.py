@@ -9,7 +9,7 @@ from typing import Any
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
     Judged,
     JudgedRun,
@@ -89,24 +89,20 @@ class JobChange:
     worst: FigureChange
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CompareResult(JudgedResult):
     """Changes of figures, verdicts and jobs, regressions first.
 
     verdicts: run, recording, change, and labels before and after. jobs: over enough recordings, which decide in place
     of figures. differences: settings, versions and inputs, before and after. only_before: not compared.
     """
 
-    __repr__ = brief
-
-    verdict: Verdict
     verdicts: tuple[Mapping[str, str], ...]
     figures: tuple[FigureChange, ...]
     jobs: tuple[JobChange, ...]
     differences: Mapping[str, tuple[str, str]]
     only_after: tuple[str, ...]
     only_before: tuple[str, ...] = ()
-    metrics: Mapping[str, int]
     baseline: Path | None = None
 
     def as_dict(self) -> dict[str, Any]:

@@ -118,8 +118,15 @@ class Bound:
             **{"who": found.who, "words": found.sentence},
         }
         if self.breaks(value, allowed, tolerance):
-            sentence, more = self.say.format(**words), {"unit": self.unit, "remedy": self.remedy, "label": self.label}
-            yield replace(found, outcome=self.outcome, sentence=sentence, threshold=allowed, **more)
+            yield replace(
+                found,
+                outcome=self.outcome,
+                sentence=self.say.format(**words),
+                threshold=allowed,
+                unit=self.unit,
+                remedy=self.remedy,
+                label=self.label,
+            )
         elif self.kept:
             yield passed_reason(self.kept.format(**words), value, allowed, self.unit, found.count or 0)
 
@@ -136,7 +143,7 @@ class Bound:
 
     def values(self, trace: Trace) -> Float64:
         """The column (T,); NaN where space about the arm was not evaluated."""
-        values: Float64 = trace[self.on]
+        values: Float64 = trace[str(self.on)]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
     @property
@@ -146,8 +153,9 @@ class Bound:
     @property
     def docs(self) -> str:
         """Row of the documentation's table of limits, its cells separated by |."""
-        within = "more than the margin" if self.at_most is None else f"at most {100 * float(self.at_most):g} %"
-        return f"{self.asked} | {f'more than {1e3 * self.above:g} mm' if self.above else within} | {self.why}"
+        within = f"more than {1e3 * self.above:g} mm" if self.above else "more than the margin"
+        within = f"at most {100 * self.at_most:g} %" if isinstance(self.at_most, float) else within
+        return f"{self.asked} | {within} | {self.why}"
 
     def _worst_state(self, trace: Trace, least: float) -> Reason | None:
         """With `above`, its place too, and the number of states not allowed."""
@@ -156,7 +164,7 @@ class Bound:
         if found is None or (self.at_most, self.at_least) != (None, None):
             return found
         at, places = int(pick(values)), trace["class_places" if self.parts else f"{self.on}_place"]
-        nearest = min(self.parts, key=lambda kind: float(trace[self.on][at, kind]), default=0)
+        nearest = min(self.parts, key=lambda kind: float(trace[str(self.on)][at, kind]), default=0)
         place = tuple(places[at, 3 * nearest : 3 * nearest + 3].tolist())
         cause = "at ({:.2f}, {:.2f}, {:.2f}) m".format(*place)
         return replace(found, place=place, cause=cause, count=int((values <= least).sum()))
