@@ -226,14 +226,14 @@ class JudgedResult(Result):
     verdict: Verdict
 
 
-def read_verdict(command: str, document: Mapping[str, Any]) -> Verdict:
-    """Verdict of what `Verdict.as_dict` returned."""
+def read_verdict(document: Mapping[str, Any]) -> Verdict:
+    """A replay's verdict, of what `Verdict.as_dict` returned."""
     rows = [
         row | {"outcome": Outcome(row["outcome"]), "place": row["place"] and tuple(row["place"])}
         for row in document["reasons"]
     ]
     return Verdict(
-        command=command,
+        command="replay",
         outcome=Outcome(document["outcome"]),
         label=document["label"],
         scope=document["scope"],

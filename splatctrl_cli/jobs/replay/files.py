@@ -88,7 +88,7 @@ def write_replay(
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
     if replay.separation is not None:
-        write_json(folder / "separation.json", separation_document(replay.separation))
+        write_json(folder / "separation.json", separation_document(replay, metrics))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay)

@@ -107,7 +107,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         replay=found,
         metrics=metrics,
         verdict=verdict,
-        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found.separation)),
+        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found, metrics)),
         is_damaged=bool(inputs.source.loss.damaged),
     )
 
