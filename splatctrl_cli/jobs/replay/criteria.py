@@ -83,8 +83,8 @@ class Bound:
 
     on: a column (T,) of the trace, for `parts` of (T, K) their least; or what returns the worst value, perhaps with
     words. who: column of names. at_most, at_least: the allowed value, or where the input has it; `tolerance` beyond
-    it passes. above: to be exceeded (0: the margin). say, kept: sentences, with the words of
-    `__call__`; without `kept` nothing passes. asked, why: for the documentation.
+    it passes. above: to be exceeded (0: the margin). say, kept: sentences, with the words of `__call__`; without
+    `kept` nothing passes. quantity, why: words for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]
@@ -100,7 +100,7 @@ class Bound:
     remedy: str = ""
     outcome: Outcome = Outcome.NOT_EVALUABLE
     label: str = ""
-    asked: str = ""
+    quantity: str = ""
     why: str = ""
 
     def __call__(self, judged: Judged) -> Iterator[Reason]:
@@ -155,7 +155,7 @@ class Bound:
         """Row of the documentation's table of limits, its cells separated by |."""
         within = f"more than {1e3 * self.above:g} mm" if self.above else "more than the margin"
         within = f"at most {100 * self.at_most:g} %" if isinstance(self.at_most, float) else within
-        return f"{self.asked} | {within} | {self.why}"
+        return f"{self.quantity} | {within} | {self.why}"
 
     def _worst_state(self, trace: Trace, least: float) -> Reason | None:
         """With `above`, its place too, and the number of states not allowed."""

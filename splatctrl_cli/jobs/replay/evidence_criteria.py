@@ -37,7 +37,7 @@ from splatctrl_cli.voxels import EvidenceClass
 
 LIMITS = (
     Bound(
-        asked="never seen, of all points within the margin",
+        quantity="never seen, of all points within the margin",
         why="correct recordings of three cameras leave up to 49 %; what this limit alone rejects leaves 50 % or more",
         on="unseen",
         at_most=UNSEEN,
@@ -46,7 +46,7 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
-        asked="never seen, from a surface of the map",
+        quantity="never seen, from a surface of the map",
         why="an object may extend into space on its unseen side",
         on="unseen_to_surface",
         unit="m",
@@ -56,7 +56,7 @@ LIMITS = (
         remedy="add a camera that sees that side",
     ),
     Bound(
-        asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        quantity="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
         why="space that is almost entirely unseen may hold a whole object",
         on="blind_to_surface",
         unit="m",
@@ -66,7 +66,7 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
-        asked="unanswered, from the arm",
+        quantity="unanswered, from the arm",
         why="a dark, shiny or transparent object returns no depth where depth is expected",
         on="class_distance",
         unit="m",
@@ -75,7 +75,7 @@ LIMITS = (
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
     Bound(
-        asked="contradicted, from the arm",
+        quantity="contradicted, from the arm",
         why="depth of a shiny object may lie far behind it",
         on="class_distance",
         unit="m",
@@ -85,7 +85,7 @@ LIMITS = (
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
     Bound(
-        asked="depth edge, from the arm",
+        quantity="depth edge, from the arm",
         why="a surface may extend one pixel past an edge without depth",
         on="class_distance",
         unit="m",
@@ -94,7 +94,7 @@ LIMITS = (
         remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
     ),
     Bound(
-        asked="outside of the workspace, from the arm",
+        quantity="outside of the workspace, from the arm",
         why="the map ends there",
         on="class_distance",
         unit="m",
@@ -106,7 +106,7 @@ LIMITS = (
 BY_FEW = {
     num: replace(
         LIMITS[0],
-        asked=f"never seen by {cameras}, of all points within the margin",
+        quantity=f"never seen by {cameras}, of all points within the margin",
         why=f"the far side of the arm may hide a whole object from {them}",
         at_most=most,
     )
@@ -116,7 +116,7 @@ BY_FEW = {
     )
 }
 PROOF = Bound(
-    asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
+    quantity="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by assumption",
     on="class_distance",
     unit="m",
