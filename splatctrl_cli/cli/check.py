@@ -96,13 +96,13 @@ def _fact(value: object) -> str:
 
 
 def run_ingest(args: argparse.Namespace, console: Console) -> int:
-    capture, metrics = ingest(request_of(IngestRequest, args), console)
-    lost = metrics["loss"]
+    result = ingest(request_of(IngestRequest, args), console)
+    metrics, lost = result.metrics, result.metrics["loss"]
     lines = [
         *table(["camera", "frames"], sorted(metrics["frames"].items())),
         *(f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"),
         *(f"note: {note}" for note in lost["notes"]),
         f"joint states: {metrics['joint_states']}",
-        f"wrote {capture}",
+        f"wrote {result.out}",
     ]
-    return console.result({"capture": str(capture), **metrics}, lines, code=DAMAGED if lost["damaged"] else 0)
+    return console.show(result, lines, code=DAMAGED if lost["damaged"] else 0)

@@ -360,7 +360,7 @@ class Console:
         document = result.document or {"out": result.out, **result.metrics}
         if isinstance(result, JudgedResult):
             return self.concluded(result.verdict, document, lines, code=code, has_findings=has_findings)
-        return self.result(document, lines)
+        return self.result(document, lines, code=code or 0)
 
     def concluded(
         self,

@@ -78,7 +78,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         for doubt in doubts_of(request, robot, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
-            found = replayed(request, inputs, config, progress)
+            found = replayed(request, inputs, progress)
         inputs.scene.finish()
         logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
