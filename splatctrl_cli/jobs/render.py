@@ -20,11 +20,11 @@ from splatctrl_cli.files.output import Stopwatch, output_path, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.geometry import interpolate_transform, transform_from
 from splatctrl_cli.jobs.reconstruct.correct_views import corrected
-from splatctrl_cli.jobs.score.views import final_splats, render_with_shell
+from splatctrl_cli.jobs.score.views import render_with_shell, splats_and_shell
 from splatctrl_cli.libraries import import_extra
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
 PNG, MP4 = ".png", ".mp4"
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # [m], of T_world_camera
@@ -184,7 +184,7 @@ def _images(
     request: RenderSceneRequest, scene: SceneFolder, lens: Intrinsics, track: _Track, times: Sequence[float]
 ) -> Iterator[UInt8]:
     """Pictures (H, W, 3), RGB; of depth from red near by to blue at the first one's farthest, black without."""
-    splats_at = lru_cache(maxsize=1)(partial(_splats_at, scene))
+    splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))
     stamps, farthest = _stamps(scene), 0.0
     for time_s in times:
         stamp_ns = scene.snapshot_at(stamps[0] + round(1e9 * time_s)).stamp_ns if stamps else None
@@ -192,11 +192,6 @@ def _images(
         view, depth = render_with_shell(splats, shell, lens, track.pose(time_s), scene.background, request.threads)
         farthest = farthest or float(depth.max())
         yield _color_depth(depth, farthest) if request.depth else _quantise(view.color)
-
-
-def _splats_at(scene: SceneFolder, stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
-    splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
-    return splats, scene.shell_at(stamp_ns)
 
 
 def _quantise(color: Float32) -> UInt8:
@@ -210,7 +205,7 @@ def render_newest(scene: SceneFolder, source: FrameSource, threads: int = 0) -> 
     off, has_times = scene.run.get("metrics", {}).get("displaced_cameras") or {}, bool(_stamps(scene))
     for item in newest.values():
         frame = corrected(correct_pose(item.frame, off), scene.corrections)
-        splats, shell = _splats_at(scene, frame.stamp_ns if has_times else None)
+        splats, shell = splats_and_shell(scene, frame.stamp_ns if has_times else None)
         pose = frame.T_world_camera
         view, _ = render_with_shell(splats, shell, frame.intrinsics, pose, scene.background, threads)
         yield frame, _quantise(view.color)
