@@ -11,8 +11,8 @@ from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
 from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
-    Judged,
     JudgedRun,
+    JudgedRuns,
     WorstState,
     read_baseline,
     read_judged,
@@ -150,7 +150,7 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     return replace(result, baseline=request.update_baseline)
 
 
-def _check_alike(before: Judged, after: Judged) -> None:
+def _check_alike(before: JudgedRuns, after: JudgedRuns) -> None:
     refuse_if(
         before.kind != after.kind, f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}"
     )
@@ -180,7 +180,7 @@ def _check_alike(before: Judged, after: Judged) -> None:
         )
 
 
-def _compare(before: Judged, after: Judged) -> CompareResult:
+def _compare(before: JudgedRuns, after: JudgedRuns) -> CompareResult:
     pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
     only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
@@ -303,7 +303,7 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         )
 
 
-def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
+def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: JudgedRuns) -> Iterator[Reason]:
     for one in verdicts:
         name = f"verdict of {one['run']}"
         words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"

@@ -66,9 +66,7 @@ class Scorer:
         scene, has_clock = self.scene, self.has_clock
         off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
-        splats_at = lru_cache(maxsize=1)(
-            partial(splats_and_shell, scene)
-        )  # read once for its views
+        splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))  # read once for its views
         views = views_to_score(
             self.reference.source,
             scoring=self.cameras,
