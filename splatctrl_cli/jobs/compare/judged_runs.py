@@ -1,4 +1,4 @@
-"""JudgedRuns runs to compare: of a folder, a batch, or a baseline."""
+"""Judged runs to compare: of a folder, a batch, or a baseline."""
 
 import json
 import math
