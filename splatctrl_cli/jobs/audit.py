@@ -80,7 +80,7 @@ class AuditRequest(RunOptions):
 
 @dataclass(kw_only=True)
 class _Steps:
-    """The steps in `folder`; done: what made each one, and the digest of its file, by name."""
+    """The steps in `folder`; done: inputs and digest of each."""
 
     folder: Path
     inputs: Mapping[str, object]
@@ -165,7 +165,7 @@ def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
-    """sha256 of the spheres given, of the robot's text and meshes; a step that needs a missing mesh refuses it."""
+    """sha256 of the given spheres, and of the robot's text and meshes."""
     found = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
     if urdf is None:
         return found
@@ -177,7 +177,7 @@ def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
 
 
 def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
-    """Replays by folder: of the logged motion, and of the driven one if there is a goal."""
+    """Replays by folder, of a driven motion with a goal alone."""
     logged = ReplayRequest(
         log=request.log,
         options=request.options,
@@ -219,7 +219,7 @@ def _goal(request: ReplayRequest) -> list[str]:
 
 
 def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
-    """Make the folder; return the steps done in it, none if they are to be repeated."""
+    """Make the folder; return the steps done in it, none to repeat."""
     out, file, other = request.out, request.out / STEPS, "give another --out"
     with refuse_faults(
         lambda error: f"{out}: cannot be written: {error.strerror}", OSError, remedy=other, error=UsageError

@@ -56,9 +56,9 @@ def mm(metres: float) -> str:
 def worst_state(
     trace: Trace, values: Float64, pick: Callable[[Float64], np.intp] = np.nanargmin, who: Sequence[str] = ()
 ) -> Reason | None:
-    """The one of values (T,) that `pick` takes, as a reason without a sentence; None without values.
+    """The value of (T,) that `pick` takes, as a reason without a sentence; None without values.
 
-    who (T,): names. count: of the values.
+    who (T,): names.
     """
     count = int(np.sum(~np.isnan(values)))
     if not count:
@@ -81,10 +81,9 @@ Number = float | Callable[[Judged], float]
 class Bound:
     """A threshold as a row of a table; the worst value of a quantity decides.
 
-    on: a column (T,) of the trace, for `parts` of (T, K) their least; or what returns the worst value, perhaps with
-    words. who: column of names. at_most, at_least: the allowed value, or where the input has it; `tolerance` beyond
-    it passes. above: to be exceeded (0: the margin). say, kept: sentences, with the words of `__call__`; without
-    `kept` nothing passes. quantity, why: words for the documentation.
+    on: a column (T,) of the trace, of (T, K) the least of `parts`; or a function of the worst value. who: column of
+    names. at_most, at_least: the allowed value, or where the input has it, and its `tolerance`. above: to be exceeded
+    (0: the margin). say, kept: sentences, without `kept` no passed reason. quantity, why: for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]
@@ -131,7 +130,7 @@ class Bound:
             yield passed_reason(self.kept.format(**words), value, allowed, self.unit, found.count or 0)
 
     def breaks(self, values: Any, allowed: float, tolerance: float = 0.0) -> Any:
-        """True where a value, or for the one that, is not allowed."""
+        """True for values that are not allowed."""
         if self.at_most is not None:
             return values > allowed + tolerance
         return values <= allowed if self.at_least is None else values < allowed - tolerance
@@ -158,7 +157,7 @@ class Bound:
         return f"{self.quantity} | {within} | {self.why}"
 
     def _worst_state(self, trace: Trace, least: float) -> Reason | None:
-        """With `above`, its place too, and the number of states not allowed."""
+        """Add to `above` the place and the number of broken states."""
         values, pick = self.values(trace), np.nanargmin if self.at_most is None else np.nanargmax
         found = worst_state(trace, values, pick, trace[self.who] if self.who else ())
         if found is None or (self.at_most, self.at_least) != (None, None):
@@ -210,7 +209,7 @@ EVIDENCE_AGE = Bound(
 
 
 def _blame_end(judged: Judged, reasons: Iterable[Reason]) -> Iterator[Reason]:
-    """Name the end of the log, where a driven motion continues past it, as the cause of an age [s]."""
+    """Explain an age by the end of the log, if the motion continues past it."""
     lasts, past = judged.replay.trace.seconds(-1) - judged.past_end_s, judged.past_end_s
     for reason in reasons:
         since = (reason.value or 0.0) - ((reason.time_s or 0.0) - lasts)
@@ -226,7 +225,7 @@ def _blame_end(judged: Judged, reasons: Iterable[Reason]) -> Iterator[Reason]:
 
 
 def _oldest_map(judged: Judged) -> Reason | None:
-    """The oldest map, with the states about it that have one too old."""
+    """The oldest map, and the interval about it."""
     trace = judged.replay.trace
     ages = trace["map_age_s"]
     found = worst_state(trace, ages, np.nanargmax)
@@ -440,7 +439,7 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def _commanded(judged: Judged) -> Reason | None:
-    """The largest velocity that a user's controller commands, as a share of its limit."""
+    """The largest velocity commanded, as a share of its limit."""
     replay = judged.replay
     if replay.outside is None:
         return None

@@ -244,7 +244,7 @@ class _SeparationPass:
 
 
 def _joint_speeds(inputs: ReplayInputs, replay: Replay) -> Float64:
-    """Joint velocities (T, J): those of a driven arm are its commands, and 0 where it had none."""
+    """Joint velocities (T, J), of a driven arm its commands or 0."""
     if replay.closed_loop is not None:
         return np.asarray(np.nan_to_num(replay.trace["v"]), np.float64)
     stamps = replay.trace.stamp_ns

@@ -282,8 +282,9 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Find postures (K, J) with the tip at a pose (4, 4), moved nearer to the base if out of reach. q: the simulated
-    arm's, a first guess.
+    """Find postures (K, J) with the tip at a pose (4, 4), or nearer to the base.
+
+    q: a first guess.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -317,9 +318,7 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close or slowed; infinite in collision. A slowed leg must avoid all, since
-    objects move.
-    """
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision."""
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]
     if is_late and any(primitive.track is not None for primitive in scene.primitives):
