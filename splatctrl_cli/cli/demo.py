@@ -10,6 +10,7 @@ from pkgutil import resolve_name
 
 from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.jobs.demo import PICTURES, DemoRequest, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 
@@ -30,9 +31,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     verdict, out, seconds = demo(request, perform, console), request.out, time.perf_counter() - args.began
     shown = [f"{description}: {out / name}" for name, description in PICTURES.items()]
-    return console.concluded(
-        verdict,
-        {"out": str(out), "seconds": round(seconds, 1), "pictures": [str(out / name) for name in PICTURES]},
+    document = {"out": out, "seconds": round(seconds, 1), "pictures": [out / name for name in PICTURES]}
+    return console.show(
+        JudgedResult(document=document, verdict=verdict),
         [f"done in {seconds:.0f} s; look at", *shown, f"everything else is in {out}/"],
     )
 

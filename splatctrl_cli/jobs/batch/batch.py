@@ -79,8 +79,10 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
         finally:
             if scheduler.keys:  # it knows what each node is to be
                 write_batch(out, suite, every, ledger.latest(), scheduler.keys)
+    document = {"out": out, "suite": suite.name, "kept": scheduler.num_kept}
     return BatchResult(
         out=out,
+        document=document | {"nodes": [run.document() for run in runs]},
         suite=suite.name,
         jobs=[job.name for job in suite.jobs],
         runs=runs,

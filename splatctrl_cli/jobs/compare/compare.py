@@ -147,7 +147,8 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     if request.update_baseline is not None:
         write_baseline(request.update_baseline, after)
         progress.log(f"wrote {request.update_baseline}")
-    return replace(result, baseline=request.update_baseline)
+    result = replace(result, baseline=request.update_baseline)
+    return replace(result, document=result.as_dict())
 
 
 def _check_alike(before: JudgedRuns, after: JudgedRuns) -> None:
