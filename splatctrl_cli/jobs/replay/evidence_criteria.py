@@ -21,18 +21,9 @@ from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
 from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, lacking, passed_reason
 from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
-from splatctrl_cli.jobs.replay.criteria import (
-    CLOCKS,
-    MARGIN,
-    UNKNOWN,
-    Bound,
-    Judged,
-    evidence_age,
-    judged_time,
-    map_age,
-    mm,
-)
+from splatctrl_cli.jobs.replay.criteria import MARGIN, UNKNOWN, Bound, Judged, mm
 from splatctrl_cli.jobs.replay.request import OCCUPIED
+from splatctrl_cli.jobs.replay.time_criteria import CLOCKS, evidence_age, judged_time, map_age
 from splatctrl_cli.voxels import EvidenceClass
 
 LIMITS = (
