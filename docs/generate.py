@@ -13,8 +13,8 @@ from splatctrl_cli.formats.grid.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.formats.splat.gaussian_ply import SplatFormat
 from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.jobs.compare.judged_runs import scales
-from splatctrl_cli.jobs.replay.criteria import Judged
-from splatctrl_cli.jobs.replay.evidence_criteria import BY_FEW, LIMITS, PROOF, Limit
+from splatctrl_cli.jobs.replay.criteria import Bound, Judged
+from splatctrl_cli.jobs.replay.evidence_criteria import BY_FEW, LIMITS, PROOF
 from splatctrl_cli.jobs.replay.verdict import CRITERIA
 from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.folder.layout import Layout
@@ -78,7 +78,7 @@ def _general(name: str, names: Container[str]) -> str:
     return name
 
 
-Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Limit | Compared
+Entry = SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Bound | Compared
 Registry = tuple[tuple[str, ...], Iterable[Entry]]
 LISTS: dict[str, Registry] = {  # with the words before what follows an entry's first sentence
     "criteria": (("**else**",), CRITERIA),

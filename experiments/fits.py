@@ -20,11 +20,10 @@ from experiments.tables import aligned, shown
 from splatctrl_cli import (
     Config,
     InputError,
+    JudgedResult,
     ReconstructRequest,
-    ReconstructResult,
     RecordingRequest,
     ScoreRequest,
-    ScoreResult,
     SourceOptions,
     SplatCtrlError,
     UsageError,
@@ -85,9 +84,9 @@ class Fitted:
 
     scan: str
     method: str
-    scene: ReconstructResult
+    scene: JudgedResult
     memory: float | None
-    score: ScoreResult
+    score: JudgedResult
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; psnr [dB] by the protocol: over the mask where there is one."""
@@ -194,8 +193,8 @@ def fit_scans(request: FitRequest) -> dict[str, Any]:
             scenes = {name: _fit(request, recording, name, folder / scan / name / "scene") for name in METHODS}
             # scored after both were fitted: what scoring leaves in memory then counts for neither
             for name, (scene, memory) in scenes.items():
-                kept = None if out is None else folder / scan / name / "score"
-                scored = score(ScoreRequest(scene=scene.out, recording=recording, out=kept, threads=request.threads))
+                made, kept = folder / scan / name / "scene", None if out is None else folder / scan / name / "score"
+                scored = score(ScoreRequest(scene=made, recording=recording, out=kept, threads=request.threads))
                 fits.append(Fitted(scan=scan, method=name, scene=scene, memory=memory, score=scored))
         report = _report(request, fits)
         if out is not None:
@@ -227,7 +226,7 @@ def _with_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
 
 def _fit(
     request: FitRequest, recording: RecordingRequest, method: str, out: Path
-) -> tuple[ReconstructResult, float | None]:
+) -> tuple[JudgedResult, float | None]:
     """The scene of one method, and the peak memory [MiB] of this process during the fit, None where the system does
     not tell. Raises InputError with what it says where it does not end well.
     """
@@ -282,7 +281,7 @@ def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
         metrics |= {f"{what}_{method.key}": value for what, value in means.items()}
     ours, theirs = metrics["psnr_ours"], metrics["psnr_3dgs"]
     metrics["psnr_gain"] = None if ours is None or theirs is None else ours - theirs
-    protocol = fits[0].score.report["protocol"]
+    protocol = fits[0].score.document["protocol"]
     return {
         "source": str(request.recording.path),
         "scans": list(dict.fromkeys(fit.scan for fit in fits)),
@@ -296,9 +295,7 @@ def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
         },
         "paper": {method.name: {"psnr": method.psnr, "splats": method.splats} for method in METHODS.values()},
         "metrics": metrics,
-        "warnings": [
-            f"{fit.scan}, {METHODS[fit.method].name}: {line}" for fit in fits for line in fit.score.report["warnings"]
-        ],
+        "warnings": [f"{fit.scan}, {METHODS[fit.method].name}: {line}" for fit in fits for line in fit.score.notes],
         "fits": [fit.as_dict() for fit in fits],
     }
 

@@ -10,11 +10,11 @@ from experiments.densify import GaussianSettings
 from experiments.gaussian_fitter import GaussianAuditRow, GaussianFitter
 from splatctrl_cli import (
     InputError,
+    JudgedResult,
     Outcome,
     Progress,
     Reason,
     ReconstructRequest,
-    ReconstructResult,
     UsageError,
 )
 from splatctrl_cli.blocks import (
@@ -33,7 +33,7 @@ from splatctrl_cli.blocks import (
 
 def reconstruct_gaussians(
     request: ReconstructRequest, settings: GaussianSettings | None = None, progress: Progress = SILENT
-) -> ReconstructResult:
+) -> JudgedResult:
     """Fit, and write the scene folder. Of the request count source, out, force, config, box, seed and threads.
 
     Raises UsageError for a recording with a clock.
@@ -84,7 +84,7 @@ def reconstruct_gaussians(
             seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    return ReconstructResult(out=request.out, metrics=metrics, verdict=verdict, removed={}, seconds=stopwatch.seconds)
+    return JudgedResult(out=request.out, metrics=metrics, verdict=verdict, seconds=stopwatch.seconds)
 
 
 def _auditor(path: Path, rows: list[GaussianAuditRow], progress: Progress) -> Callable[[GaussianAuditRow], None]:

@@ -160,7 +160,7 @@ def verdict_on(robot: MeasuredRobot, position: Float64, stamp_ns: int, known: Kn
         surfaces=robot.surfaces,
         kept=robot.kept,
     )
-    found = replayed(REQUEST, inputs, config, SILENT)
-    metrics = metrics_of(found) | logged.metrics()
     request = ReplayRequest(log=REQUEST.log, out=REQUEST.out, config=config)
+    found = replayed(request, inputs, SILENT)
+    metrics = metrics_of(found) | logged.metrics()
     return replay_verdict(Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics))

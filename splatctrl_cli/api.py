@@ -6,44 +6,38 @@
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.control.user_controller import ClearanceRow, Controller, ControllerInput, ControllerStart
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
-from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
-from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.evaluate.verdict import JudgedResult, Outcome, Reason, Result, Verdict
+from splatctrl_cli.jobs.audit import AuditRequest, audit
+from splatctrl_cli.jobs.bake.bake import bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.compare.compare import CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.export.export import (
     ExportRequest,
-    ExportResult,
     ExportRunRequest,
-    ExportRunResult,
     export,
     export_run,
 )
-from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.query.query import QueryRequest, query
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.render import RenderSceneRequest, RenderSceneResult, render_scene
+from splatctrl_cli.jobs.render import RenderSceneRequest, render_scene
 from splatctrl_cli.jobs.replay.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import (
     ViewRequest,
-    ViewResult,
     WriteReportRequest,
-    WriteReportResult,
     view,
     write_report,
 )
 from splatctrl_cli.jobs.running.progress import Progress
-from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 
 __all__ = [
     "AuditRequest",
-    "AuditResult",
     "BakeRequest",
-    "BakeResult",
     "Box",
     "ClearanceRow",
     "CompareRequest",
@@ -53,35 +47,29 @@ __all__ = [
     "ControllerInput",
     "ControllerStart",
     "ExportRequest",
-    "ExportResult",
     "ExportRunRequest",
-    "ExportRunResult",
     "InputError",
+    "JudgedResult",
     "Label",
     "NotEvaluableError",
     "Outcome",
     "Progress",
     "QueryRequest",
-    "QueryResult",
     "Reason",
     "ReconstructRequest",
-    "ReconstructResult",
     "RecordingRequest",
     "RenderSceneRequest",
-    "RenderSceneResult",
     "ReplayRequest",
     "ReplayResult",
+    "Result",
     "ScoreRequest",
-    "ScoreResult",
     "SourceOptions",
     "SplatCtrlError",
     "UsageError",
     "Verdict",
     "ViewRequest",
-    "ViewResult",
     "WriteError",
     "WriteReportRequest",
-    "WriteReportResult",
     "audit",
     "bake",
     "compare",

@@ -124,7 +124,7 @@ def test_a_log_is_written_of_it_with_its_truth(tmp_path: Path, tasks: Callable[[
         return tasks("merged-cubby").scene(model, options, 5)
 
     result = simulate(SimulateRequest(out=tmp_path / "cubby", options=options, scene=scene))
-    assert result.num_frames == {f"cam{n}": 4 for n in range(5)}
+    assert result.metrics["frames"] == {f"cam{n}": 4 for n in range(5)}
     assert result.truth.clearance.min() > drawn_task.TASK_CLEARANCE - 1e-3
 
 

@@ -9,11 +9,10 @@ from experiments import fits
 from experiments.__main__ import main
 from splatctrl_cli import (
     InputError,
+    JudgedResult,
     ReconstructRequest,
-    ReconstructResult,
     RecordingRequest,
     ScoreRequest,
-    ScoreResult,
 )
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.verdict import note, verdict_of
@@ -58,16 +57,16 @@ def test_the_mean_is_over_the_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def fit(
         request: fits.FitRequest, recording: RecordingRequest, method: str, out: Path
-    ) -> tuple[ReconstructResult, float | None]:
+    ) -> tuple[JudgedResult, float | None]:
         verdict = verdict_of("reconstruct", [])
-        scene = ReconstructResult(out=out, metrics={"splats": 100}, verdict=verdict, removed={}, seconds={"fit": 3.0})
+        scene = JudgedResult(out=out, metrics={"splats": 100}, verdict=verdict, seconds={"fit": 3.0})
         return scene, 50.0 if recording.scan == "scan1" else 70.0
 
-    def score(request: ScoreRequest) -> ScoreResult:
+    def score(request: ScoreRequest) -> JudgedResult:
         metrics = {"psnr_seen": 1.0, "psnr_all": psnr.get((request.recording.scan or "", request.scene.parent.name))}
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "resolution": ["1x1"]}
         report = {"metrics": metrics, "protocol": protocol, "warnings": ["odd"]}
-        return ScoreResult(report=report, verdict=verdict_of("score", []))
+        return JudgedResult(document=report, metrics=metrics, notes=("odd",), verdict=verdict_of("score", []))
 
     monkeypatch.setattr(fits, "_fit", fit)
     monkeypatch.setattr(fits, "score", score)
@@ -102,9 +101,9 @@ def test_what_cannot_be_fitted_is_refused_by_name(
 
 
 def test_a_fit_whose_verdict_does_not_pass_is_not_scored(monkeypatch: pytest.MonkeyPatch) -> None:
-    def damaged(request: ReconstructRequest, settings: object) -> ReconstructResult:
+    def damaged(request: ReconstructRequest, settings: object) -> JudgedResult:
         verdict = verdict_of("reconstruct", [note(criterion="x", sentence="y")], scope="7 views", is_damaged=True)
-        return ReconstructResult(out=request.out, metrics={}, verdict=verdict, removed={}, seconds={})
+        return JudgedResult(out=request.out, metrics={}, verdict=verdict, seconds={})
 
     monkeypatch.setattr(fits, "reconstruct_gaussians", damaged)
     recording = RecordingRequest(path=SAMPLE, is_dtu=True, protocol="holdout:0")

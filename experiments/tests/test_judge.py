@@ -69,7 +69,7 @@ def test_the_back_of_a_thing_that_the_arm_at_rest_hid_from_all_cameras_is_not_sa
     assert judge.against_truth(hidden_back, way, views).clearance < 0.01
     assert known is not None
     assert judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS).label == "not evaluable"
-    without = [limit for limit in LIMITS if limit.column != "blind_to_surface"]
+    without = [limit for limit in LIMITS if limit.on != "blind_to_surface"]
     monkeypatch.setattr(evidence_criteria, "LIMITS", without)
     assert judge.verdict_on(robot, way, rig.task.stamp_ns, known, SETTINGS).label == "safe"  # it would still pass
 

@@ -15,5 +15,4 @@ def run(args: argparse.Namespace, console: Console) -> int:
     shared = {find_action(args.parser, "audit", name): value for name, value in given.items() if name not in OWN}
     words = [word for action, value in shared.items() for word in words_of("audit", action, value, Path())]
     result = audit(request_of(AuditRequest, args, words=tuple(words)), console)
-    found = {"out": str(result.out), "page": str(result.page), "made": list(result.made)}
-    return console.concluded(result.verdict, found, [f"page: {result.page}"], has_findings=True)
+    return console.show(result, [f"page: {result.document['page']}"], has_findings=True)

@@ -53,16 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             [*table(("node", "state", "needs"), rows), "", *commands],
         )
     result = batch(request, command_line, console)
-    code = console.concluded(
-        result.verdict,
-        {
-            "out": str(result.out),
-            "suite": result.suite,
-            "kept": result.num_kept,
-            "nodes": [run.document() for run in result.runs],
-        },
-        _lines(result, is_long=args.verbose > 0),
-    )
+    code = console.show(result, _lines(result, is_long=args.verbose > 0))
     publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
     return code
 

@@ -11,7 +11,7 @@ from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, cali
 
 def run(args: argparse.Namespace, console: Console) -> int:
     result = calibrate(request_of(CalibrateRequest, args), console)
-    return console.result({"out": str(result.out), **result.metrics}, _lines(result))
+    return console.show(result, _lines(result))
 
 
 def _lines(result: CalibrateResult) -> Iterator[str]:

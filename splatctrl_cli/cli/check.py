@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from splatctrl_cli.checks.finding import CheckReport
 from splatctrl_cli.cli.common import Console, format_cell, remarks, request_of, table
 from splatctrl_cli.errors import DAMAGED
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
@@ -19,7 +20,8 @@ WIDTH = 118  # columns of text
 def run(args: argparse.Namespace, console: Console) -> int:
     report, verdict = check(request_of(CheckRequest, args))
     code = 0 if args.fail_on == "never" else verdict.exit_code
-    return console.concluded(verdict, report.as_dict(), _lines(report), code=code, has_findings=True)
+    result = JudgedResult(document=report.as_dict(), verdict=verdict)
+    return console.show(result, _lines(report), code=code, has_findings=True)
 
 
 def _lines(report: CheckReport) -> Iterator[str]:
@@ -96,13 +98,13 @@ def _fact(value: object) -> str:
 
 
 def run_ingest(args: argparse.Namespace, console: Console) -> int:
-    capture, metrics = ingest(request_of(IngestRequest, args), console)
-    lost = metrics["loss"]
+    result = ingest(request_of(IngestRequest, args), console)
+    metrics, lost = result.metrics, result.metrics["loss"]
     lines = [
         *table(["camera", "frames"], sorted(metrics["frames"].items())),
         *(f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"),
         *(f"note: {note}" for note in lost["notes"]),
         f"joint states: {metrics['joint_states']}",
-        f"wrote {capture}",
+        f"wrote {result.out}",
     ]
-    return console.result({"capture": str(capture), **metrics}, lines, code=DAMAGED if lost["damaged"] else 0)
+    return console.show(result, lines, code=DAMAGED if lost["damaged"] else 0)

@@ -16,7 +16,7 @@ from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
 from splatctrl_cli.errors import UsageError, refuse_if
-from splatctrl_cli.evaluate.verdict import Verdict, gate
+from splatctrl_cli.evaluate.verdict import JudgedResult, Result, gate
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics
 
@@ -353,23 +353,21 @@ class Console:
                 print(line)
         return code
 
-    def concluded(
-        self,
-        verdict: Verdict,
-        result: Mapping[str, Any],
-        lines: Iterable[str],
-        *,
-        code: int | None = None,
-        has_findings: bool = False,
+    def show(
+        self, result: Result, lines: Iterable[str], *, code: int | None = None, has_findings: bool = False
     ) -> int:
-        """Print a verdict, then `result` or `lines`; return the exit code.
+        """Print a job's verdict, if it judges, and its document or `lines`; return the exit code.
 
         has_findings: `lines` contain the reasons.
         """
+        document = result.document or {"out": result.out, **result.metrics}
+        if not isinstance(result, JudgedResult):
+            return self.result(document, lines, code=code or 0)
+        verdict = result.verdict
         code = verdict.exit_code if code is None else code
         self._args.label = verdict.label
         if self.is_json:
-            self.result({"verdict": verdict.as_dict(), **result}, (), code=code)
+            self.result({"verdict": verdict.as_dict(), **document}, (), code=code)
         else:
             print(verdict.sentence)
             for reason in () if has_findings else verdict.decisive[1:10]:  # --json and summary.json have all

@@ -11,7 +11,7 @@ FORM = ".6g"
 
 def run(args: argparse.Namespace, console: Console) -> int:
     result = compare(request_of(CompareRequest, args), console)
-    return console.concluded(result.verdict, result.as_dict(), _lines(result, is_long=args.verbose > 0))
+    return console.show(result, _lines(result, is_long=args.verbose > 0))
 
 
 def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:

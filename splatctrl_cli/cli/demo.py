@@ -10,6 +10,7 @@ from pkgutil import resolve_name
 
 from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console, request_of, table
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.jobs.demo import PICTURES, DemoRequest, demo
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 
@@ -30,9 +31,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     verdict, out, seconds = demo(request, perform, console), request.out, time.perf_counter() - args.began
     shown = [f"{description}: {out / name}" for name, description in PICTURES.items()]
-    return console.concluded(
-        verdict,
-        {"out": str(out), "seconds": round(seconds, 1), "pictures": [str(out / name) for name in PICTURES]},
+    document = {"out": out, "seconds": round(seconds, 1), "pictures": [out / name for name in PICTURES]}
+    return console.show(
+        JudgedResult(document=document, verdict=verdict),
         [f"done in {seconds:.0f} s; look at", *shown, f"everything else is in {out}/"],
     )
 
@@ -44,7 +45,7 @@ def run_simulate(args: argparse.Namespace, console: Console) -> int:
         (
             camera.name,
             "training" if camera.is_training else "scoring",
-            result.num_frames[camera.name],
+            result.metrics["frames"][camera.name],
             f"{camera.intrinsics.width}x{camera.intrinsics.height}",
             f"{truth.luminance_std[camera.name]:.3f}",
         )
@@ -53,10 +54,10 @@ def run_simulate(args: argparse.Namespace, console: Console) -> int:
     lines = [
         f"{result.out}",
         "",
-        *table(("file", "bytes"), list(result.sizes.items())),
+        *table(("file", "bytes"), list(result.document["bytes"].items())),
         "",
         *table(("camera", "role", "frames", "size", "luminance std"), cells),
         "",
         f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm",
     ]
-    return console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, lines)
+    return console.show(result, lines)

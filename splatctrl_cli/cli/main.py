@@ -112,7 +112,7 @@ def _explain(error: BaseException) -> tuple[str, str, int]:
 
 
 class _Lost(io.TextIOBase):
-    """Stand-in for a stream closed before the start (``>&-``); knows if it was written to."""
+    """Stand-in for a stream closed before the start (``>&-``)."""
 
     is_written = False
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
-from splatctrl_cli.jobs.query.query import QueryRequest, QueryResult, query
+from splatctrl_cli.evaluate.verdict import Result
+from splatctrl_cli.jobs.query.query import QueryRequest, query
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -16,9 +17,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     request = request_of(QueryRequest, args)
     if args.out is not None or console.is_json:
         result = query(request, console)
-        out = None if result.out is None else str(result.out)
-        found = {"out": out, "source": result.kind, **result.metrics, "notes": result.notes}
-        return console.result(found, _query_lines(result))
+        return console.show(result, _query_lines(result))
     with tempfile.TemporaryDirectory() as folder:  # a table with a wrong line is refused before anything is printed
         answers = Path(folder) / "answers.csv"
         result = query(replace(request, out=answers), console)
@@ -29,12 +28,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _query_lines(result: QueryResult) -> list[str]:
+def _query_lines(result: Result) -> list[str]:
     num = result.metrics["num_points"] or 0
     rate = f"{num / max(result.seconds['answer'], 1e-9):,.0f} points/s"  # of fewer points it says nothing
     return [
         *table(
-            (result.kind, ""),
+            (result.document["source"], ""),
             [(name.replace("_", " "), _format_figure(name, v)) for name, v in result.metrics.items()],
         ),
         *(f"note: {note}" for note in result.notes),

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, config_of, request_of, table
 from splatctrl_cli.errors import UsageError, refuse_if
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.evaluate.verdict import Result
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.running.device import describe_device
@@ -35,16 +36,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
     )
     result = reconstruct(request, console)
-    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
-    return console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"])
+    return console.show(result, [*_lines(result), f"wrote {result.out}"])
 
 
 def recording_of(args: argparse.Namespace, path: Path, beside: tuple[Path, ...] = ()) -> RecordingRequest:
     return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=args.dtu is not None, beside=beside)
 
 
-def _lines(result: ReconstructResult) -> list[str]:
-    metrics, removed = result.metrics, result.removed
+def _lines(result: Result) -> list[str]:
+    metrics, removed = result.metrics, result.document["removed"]
     psnr = metrics["psnr"]
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},

@@ -24,9 +24,8 @@ HEADLINE = (
 
 def run(args: argparse.Namespace, console: Console) -> int:
     result = replay(request_of(ReplayRequest, args), console)
-    return console.concluded(
-        result.verdict,
-        {"out": str(result.out), **result.metrics},
+    return console.show(
+        result,
         _lines(result, is_long=args.verbose > 0, with_steps=args.steps),
         code=result.exit_code(report_only=args.report_only),
     )

@@ -4,7 +4,6 @@ import argparse
 import os
 import sys
 import webbrowser
-from dataclasses import asdict
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, remarks, request_of
@@ -19,27 +18,27 @@ def run(args: argparse.Namespace, console: Console) -> int:
     result = write_report(request_of(WriteReportRequest, args), console)
     more = len(result.notes) - MOST_NOTES
     lines = [
-        f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes",
+        "{}: {num_runs} runs, {num_scenes} in 3-D, {bytes} bytes".format(result.out, **result.metrics),
         *result.notes[:MOST_NOTES],
         *remarks((f"and {more} more not in 3-D", more > 0)),
     ]
-    return console.result(asdict(result), lines)
+    return console.show(result, lines)
 
 
 def run_view(args: argparse.Namespace, console: Console) -> int:
     result = view(request_of(ViewRequest, args))
-    found = f"{result.num_splats} splats, {result.num_states} states, {result.num_unknown} cubes never seen"
-    is_opened = not args.no_open and open_page(result.file)
-    console.result({**asdict(result), "is_opened": is_opened}, [f"{result.file}: {found}, {result.bytes} bytes"])
+    found = "{}: {num_splats} splats, {num_states} states, {num_unknown} cubes never seen, {bytes} bytes"
+    is_opened = not args.no_open and result.out is not None and open_page(result.out)
+    console.result({**result.document, "is_opened": is_opened}, [found.format(result.out, **result.metrics)])
     if not is_opened and not args.no_open:
-        console.log(f"no browser here: open {result.file.absolute()}")
+        console.log(f"no browser here: open {result.out and result.out.absolute()}")
     return 0
 
 
 def run_render(args: argparse.Namespace, console: Console) -> int:
     result = render_scene(request_of(RenderSceneRequest, args))
-    size = f"{result.width}x{result.height}"
-    return console.result(asdict(result), [f"{result.out}: {size}, pictures: {result.num_pictures}"])
+    line = "{}: {width}x{height}, pictures: {num_pictures}".format(result.out, **result.metrics)
+    return console.show(result, [line])
 
 
 def open_page(page: Path) -> bool:

@@ -134,9 +134,9 @@ def _conclude(console: Console, result: CoverageResult) -> int:
             (unclosed, report.open_links),
             (f"{report.stray_spheres} spheres are on links without collision geometry", report.stray_spheres),
         ),
-        *result.remarks,
+        *result.notes,
     ]
-    return console.concluded(result.verdict, result.document, lines, has_findings=True)
+    return console.show(result, lines, has_findings=True)
 
 
 def _row(link: LinkCoverage) -> tuple[object, ...]:

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     first, *beside = args.reference or [None]
     recording = recording_of(args, first, tuple(beside))
     result = score(request_of(ScoreRequest, args, recording=recording, cloud=_cloud(args)), console)
-    return console.concluded(result.verdict, result.report, lines_of(result.report))
+    return console.show(result, lines_of(result.document))
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:

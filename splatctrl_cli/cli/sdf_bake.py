@@ -6,7 +6,8 @@ from typing import Any
 
 from splatctrl_cli.cli.common import Console, format_cell, names_of, request_of, table
 from splatctrl_cli.config import fixed
-from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.evaluate.verdict import Result
+from splatctrl_cli.jobs.bake.bake import bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.records import Label
 
@@ -20,14 +21,15 @@ COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 def run(args: argparse.Namespace, console: Console) -> int:
     result = bake(request_of(BakeRequest, args), console)
     console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
-    found = {**result.summary, **({"accuracy": result.accuracy} if result.accuracy else {})}
-    return console.concluded(result.verdict, found, _lines(result))
+    return console.show(result, _lines(result))
 
 
-def _lines(result: BakeResult) -> Iterator[str]:
-    values = {**result.summary, "shape": " x ".join(map(str, result.summary["shape"]))}
+def _lines(result: Result) -> Iterator[str]:
+    accuracy = result.document.get("accuracy", {})
+    summary = {name: value for name, value in result.document.items() if name != "accuracy"}
+    values = {**summary, "shape": " x ".join(map(str, summary["shape"]))}
     yield from table(("field", ""), [(name.replace("_", " "), format_cell(value)) for name, value in values.items()])
-    truth, mesh, held_out = (result.accuracy.get(name) for name in ("truth", "reference_mesh", "held_out_depth"))
+    truth, mesh, held_out = (accuracy.get(name) for name in ("truth", "reference_mesh", "held_out_depth"))
     yield from () if truth is None else ("", *_truth_lines(truth))
     if mesh is not None:
         cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh["everywhere"])]

@@ -41,6 +41,10 @@ class EventKind(StrEnum):
     CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that no joint moves
 
 
+UNITS = {  # of a kind's worst value, if it has one
+    **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
+    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s", "row-broken": "m/s"},
+}
 INTERVENTIONS = frozenset(
     {
         *(EventKind.SCENE, EventKind.SELF, EventKind.LIMIT, EventKind.RELAXED),

@@ -32,23 +32,6 @@ class BandAccuracy:
     over_max: float | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class OverEstimate:
-    """Share of cells above the truth by more than `allowance` [m], and their excess."""
-
-    allowance: float
-    count: int
-    count_beyond: int
-    share_beyond: float | None
-    median_beyond: float | None
-    max_error: float | None
-
-    @property
-    def holds(self) -> bool:
-        """True if there are cells, and none exceeds the allowance."""
-        return self.count > 0 and self.count_beyond == 0
-
-
 MEDIAN = LENGTH  # errors have a sign: a mean or a median may move either way
 BAND_SCALES = {
     "count": DESCRIBES,
@@ -66,21 +49,6 @@ OVER_SCALES = {
     "median_beyond": ERROR,
     "max_error": ERROR,
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class FieldAccuracy:
-    """Bands by field name, everywhere and where seen.
-
-    Without known visibility, seen is empty and the over-estimate is over all points.
-    """
-
-    everywhere: Mapping[str, tuple[BandAccuracy, ...]]
-    seen: Mapping[str, tuple[BandAccuracy, ...]]
-    over_estimate: OverEstimate
-
-    def as_dict(self) -> dict[str, object]:
-        return {**asdict(self), "holds": self.over_estimate.holds}
 
 
 def figures_of(document: Mapping[str, Any]) -> dict[str, float | None]:
@@ -111,8 +79,11 @@ def band_name(lower: float, upper: float) -> str:
 
 def field_accuracy(
     distances: Mapping[str, NDArray[np.floating]], truth: Float64, seen: Bool | None, *, median_radius: float
-) -> FieldAccuracy:
-    """Compare fields with the truth at points outside the objects.
+) -> dict[str, Any]:
+    """Compare fields with the truth at points outside the objects, as in ``field.json``.
+
+    Everywhere and where seen: each field's bands. over_estimate: share of cells above the truth by more than
+    `allowance` [m], and their excess; holds: there are cells, and none is. Without known visibility nothing is seen.
 
     distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): a training camera saw the
     nearest true surface point; None if unknown. The over-estimate is of `hard` at seen points up to 20 cm, against 1
@@ -128,11 +99,13 @@ def field_accuracy(
     is_near = (truth >= BANDS[0][0]) & (truth < BANDS[-1][1])
     everyone = np.ones(truth.shape, dtype=np.bool_)
     counted = everyone if seen is None else seen
-    return FieldAccuracy(
-        everywhere={name: _bands(error, truth, everyone) for name, error in errors.items()},
-        seen={} if seen is None else {name: _bands(error, truth, seen) for name, error in errors.items()},
-        over_estimate=_over_estimate(errors["hard"][is_near & counted], MAP_ALLOWANCE + median_radius),
-    )
+    over = _over_estimate(errors["hard"][is_near & counted], MAP_ALLOWANCE + median_radius)
+    return {
+        "everywhere": {name: _bands(error, truth, everyone) for name, error in errors.items()},
+        "seen": {} if seen is None else {name: _bands(error, truth, seen) for name, error in errors.items()},
+        "over_estimate": over,
+        "holds": over["count"] > 0 and over["count_beyond"] == 0,
+    }
 
 
 GridDistance = tuple[NDArray[np.generic], float]
@@ -173,10 +146,9 @@ def median_radius(grid: DistanceGrid) -> float:
     return float(health["radius"])
 
 
-def _bands(error: Float64, truth: Float64, chosen: Bool) -> tuple[BandAccuracy, ...]:
-    return tuple(
-        band_accuracy(error[chosen & (truth >= lower) & (truth < upper)], lower, upper) for lower, upper in BANDS
-    )
+def _bands(error: Float64, truth: Float64, chosen: Bool) -> list[dict[str, Any]]:
+    its = ((error[chosen & (truth >= lower) & (truth < upper)], lower, upper) for lower, upper in BANDS)
+    return [asdict(band_accuracy(*each)) for each in its]
 
 
 def band_accuracy(error: Float64, lower: float, upper: float) -> BandAccuracy:
@@ -194,16 +166,16 @@ def band_accuracy(error: Float64, lower: float, upper: float) -> BandAccuracy:
     )
 
 
-def _over_estimate(error: Float64, allowance: float) -> OverEstimate:
+def _over_estimate(error: Float64, allowance: float) -> dict[str, Any]:
     beyond = error[error > allowance] - allowance
-    return OverEstimate(
-        allowance=allowance,
-        count=len(error),
-        count_beyond=len(beyond),
-        share_beyond=len(beyond) / len(error) if len(error) else None,
-        median_beyond=float(np.median(beyond)) if len(beyond) else None,
-        max_error=float(error.max()) if len(error) else None,
-    )
+    return {
+        "allowance": allowance,
+        "count": len(error),
+        "count_beyond": len(beyond),
+        "share_beyond": len(beyond) / len(error) if len(error) else None,
+        "median_beyond": float(np.median(beyond)) if len(beyond) else None,
+        "max_error": float(error.max()) if len(error) else None,
+    }
 
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
@@ -264,7 +236,7 @@ def compare_with_truth(
         "num_near": int(np.count_nonzero(is_near)),
         "num_seen": int(np.count_nonzero(is_counted & is_near)),
         "num_outside_workspace": int(np.count_nonzero(seen & ~in_workspace & is_near)),
-        **accuracy.as_dict(),
+        **accuracy,
         "error_mean": float(error.mean()) if len(error) else None,
         "error_sigma": float(error.std()) if len(error) else None,
         "reliability": {form: _curve(curve) for form, curve in curves.items()},
@@ -319,7 +291,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
         "num_unknown": int(np.count_nonzero(~is_known)),
         "num_inside": int(np.count_nonzero(is_inside)),
         "num_near": int(np.count_nonzero(is_near)),
-        **accuracy.as_dict(),
+        **accuracy,
     }
 
 

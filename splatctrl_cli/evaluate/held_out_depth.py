@@ -7,7 +7,7 @@ free: else it may know other surface.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -232,10 +232,8 @@ def compare_with_held_out_depth(
     points, values = points[is_known], {name: value[is_known] for name, value in values.items()}
     reference = np.asarray(cKDTree(measured).query(points)[0])
     radius = median_radius(grid)
-    accuracy = replace(
-        field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius),
-        over_estimate=field_accuracy(values, reference, None, median_radius=radius).over_estimate,
-    )
+    accuracy = field_accuracy(values, reference, _ball_is_free(points, reference, frames), median_radius=radius)
+    of_all = field_accuracy(values, reference, None, median_radius=radius)
     return {
         "reference": "nearest measured depth point",
         "num_frames": len(frames),
@@ -245,7 +243,7 @@ def compare_with_held_out_depth(
         "num_outside": len(drawn) - len(is_known),
         "num_unknown": int(np.count_nonzero(~is_known)),
         "on_surface": {n: asdict(band_accuracy(v[np.isfinite(v)], 0.0, 0.0)) for n, v in at_surface.items()},
-        "before": accuracy.as_dict(),
+        "before": accuracy | {name: of_all[name] for name in ("over_estimate", "holds")},
     }
 
 

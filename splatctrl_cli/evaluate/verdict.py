@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import StrEnum
 from functools import partial
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from splatctrl_cli.errors import DAMAGE, DAMAGED, UsageError, did_you_mean, refuse_if
@@ -74,13 +75,14 @@ def passed_reason(sentence: str, value: float, threshold: float, unit: str, coun
 class Criterion(Generic[E]):
     """One criterion of a verdict.
 
-    find: its reasons, if it applies; its docstring's first paragraph enters the documentation's table. broken: that
-    table's cell on a violation.
+    find: its reasons, if it applies. asked: the documentation's words, by default the first paragraph of its
+    docstring. broken: those on a violation.
     """
 
     name: str
     find: Callable[[E], Iterable[Reason]]
     broken: str
+    asked: str = ""
 
     def reasons(self, found: E) -> Iterator[Reason]:
         return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
@@ -88,7 +90,8 @@ class Criterion(Generic[E]):
     @property
     def docs(self) -> str:
         """The table's row, its cells separated by |."""
-        asked = " ".join((inspect.getdoc(self.find) or "").split("\n\n")[0].split()).removesuffix(".")
+        words = self.asked or (inspect.getdoc(self.find) or "").split("\n\n")[0]
+        asked = " ".join(words.split()).removesuffix(".")
         return f"{self.name} | {asked[0].lower()}{asked[1:]} | {self.broken}"
 
 
@@ -193,14 +196,44 @@ def verdict_of(
     )
 
 
-def read_verdict(command: str, document: Mapping[str, Any]) -> Verdict:
-    """Verdict of what `Verdict.as_dict` returned."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Result:
+    """The result of a command; its repr is a few lines.
+
+    out: the file or folder that it wrote. metrics: figures by name. document: of ``--json``, empty for `out` and the
+    metrics. notes: worth a line. seconds: by stage.
+    """
+
+    out: Path | None = None
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    document: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        shown = []
+        for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
+            text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
+            is_short = len(text) <= 80 or isinstance(value, Verdict)
+            shown.append(f"{name}={text if is_short else f'<{type(value).__name__}{size}>'}")
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class JudgedResult(Result):
+    """The result of a command that judges."""
+
+    verdict: Verdict
+
+
+def read_verdict(document: Mapping[str, Any]) -> Verdict:
+    """A replay's verdict, of what `Verdict.as_dict` returned."""
     rows = [
         row | {"outcome": Outcome(row["outcome"]), "place": row["place"] and tuple(row["place"])}
         for row in document["reasons"]
     ]
     return Verdict(
-        command=command,
+        command="replay",
         outcome=Outcome(document["outcome"]),
         label=document["label"],
         scope=document["scope"],
@@ -220,16 +253,6 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
 def damage_mark(sentence: str | None, exit_code: int | None) -> str:
     """The word ", damaged" for a run of a damaged recording, else nothing."""
     return ", damaged" if exit_code == DAMAGED or DAMAGE in (sentence or "") else ""
-
-
-def brief(result: Any) -> str:
-    """A result in a few lines: long values by type and size."""
-    shown = []
-    for name, value in ((each.name, getattr(result, each.name)) for each in fields(result)):
-        text, size = repr(value), f" of {len(value)}" if isinstance(value, Sized) else ""
-        is_short = len(text) <= 80 or isinstance(value, Verdict)
-        shown.append(f"{name}={text if is_short else f'<{type(value).__name__}{size}>'}")
-    return f"{type(result).__name__}({', '.join(shown)})"
 
 
 def plural(number: float, noun: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError, UsageError, WriteError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import Verdict, brief, lacking, read_verdict, verdict_of, worst
+from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, lacking, read_verdict, verdict_of, worst
 from splatctrl_cli.files.output import (
     Stopwatch,
     recorded_as,
@@ -78,21 +78,9 @@ class AuditRequest(RunOptions):
     words: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class AuditResult:
-    """The folder, its page and verdict; made: the steps that this call made."""
-
-    __repr__ = brief
-
-    out: Path
-    page: Path
-    verdict: Verdict
-    made: tuple[str, ...]
-
-
 @dataclass(kw_only=True)
 class _Steps:
-    """The steps in `folder`; done: what made each one, and the digest of its file, by name."""
+    """The steps in `folder`; done: inputs and digest of each."""
 
     folder: Path
     inputs: Mapping[str, object]
@@ -116,10 +104,11 @@ class _Steps:
         write_durably(self.folder / STEPS, lambda partial: write_json(partial, self.done))
 
 
-def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
+def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
     """Check, reconstruct, replay and write the page; leave out what the same inputs made before.
 
-    A log without joint states is not evaluable: its check and map stand alone. Raises UsageError for an unknown
+    A log without joint states is not evaluable: its check and map stand alone. Document: the page, and the steps
+    that this call made. Raises UsageError for an unknown
     robot, WriteError for an unwritable page, and what the steps raise.
     """
     source = open_source(request.log, request.options)
@@ -146,7 +135,7 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         goal = _goal(each)
         words = ["replay", *_words(request, name), "--scene", str(request.out / SCENE), *goal]
         steps.make(name, f"{name}/{RUN}", partial(replay, each, progress), words, **decides, goal=goal)
-    verdicts = [read_verdict("replay", open_run(each.out).verdict) for each in replays.values()]
+    verdicts = [read_verdict(open_run(each.out).verdict) for each in replays.values()]
     verdict = worst(verdicts) if verdicts else _judge_map(request)
     shown = {name: sha256(request.out / name / RUN) for name in (*replays, SCENE)}
     steps.make("report", PAGE, partial(_write_page, request, source, verdict, [*shown]), shown=shown)
@@ -160,8 +149,8 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> AuditResult:
         seed=seed,
         verdict=verdict.as_dict(),
     )
-    made = tuple(steps.stopwatch.seconds)
-    return AuditResult(out=request.out, page=request.out / PAGE, verdict=verdict, made=made)
+    document = {"out": request.out, "page": request.out / PAGE, "made": [*steps.stopwatch.seconds]}
+    return JudgedResult(out=request.out, document=document, verdict=verdict)
 
 
 def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
@@ -176,7 +165,7 @@ def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
-    """sha256 of the spheres given, of the robot's text and meshes; a step that needs a missing mesh refuses it."""
+    """sha256 of the given spheres, and of the robot's text and meshes."""
     found = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
     if urdf is None:
         return found
@@ -188,7 +177,7 @@ def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
 
 
 def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
-    """Replays by folder: of the logged motion, and of the driven one if there is a goal."""
+    """Replays by folder, of a driven motion with a goal alone."""
     logged = ReplayRequest(
         log=request.log,
         options=request.options,
@@ -230,7 +219,7 @@ def _goal(request: ReplayRequest) -> list[str]:
 
 
 def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
-    """Make the folder; return the steps done in it, none if they are to be repeated."""
+    """Make the folder; return the steps done in it, none to repeat."""
     out, file, other = request.out, request.out / STEPS, "give another --out"
     with refuse_faults(
         lambda error: f"{out}: cannot be written: {error.strerror}", OSError, remedy=other, error=UsageError

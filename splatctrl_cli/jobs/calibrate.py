@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from splatctrl_cli.calibration.solution import Solution, solved
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import pose_robot
@@ -48,44 +48,17 @@ class CalibrateRequest(RobotOptions):
     force: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalibrateResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CalibrateResult(Result):
     """The written calibration, and distances [m] to what another camera or the robot shows.
 
     before, after: `Adjustment.distance`. moved: by camera [m], [deg].
     """
 
-    out: Path
     calibration: Calibration
     moved: Mapping[str, tuple[float, float]]
     before: float | None
     after: float | None
-    num_frames: int
-
-    @property
-    def metrics(self) -> dict[str, Any]:
-        clock = self.calibration.clock
-        return {
-            "frames": self.num_frames,
-            "distance_before_mm": None if self.before is None else round(1e3 * self.before, 2),
-            "distance_after_mm": None if self.after is None else round(1e3 * self.after, 2),
-            "clock_offset_ms": None if clock is None else round(1e3 * clock, 3),
-            "sigma_clock_ms": None if clock is None else round(1e3 * self.calibration.sigma_clock, 3),
-            "cameras": {
-                name: {
-                    "moved_mm": round(1e3 * self.moved[name][0], 3),
-                    "turned_deg": round(self.moved[name][1], 4),
-                    "sigma_mm": round(1e3 * max(camera.sigma_position), 3),
-                    "sigma_deg": round(float(np.degrees(max(camera.sigma_rotation))), 4),
-                    "depth_scale": camera.scale,
-                    "depth_bias_mm": round(1e3 * camera.bias, 3),
-                    "depth_bias_noticed_mm": finite(round(1e3 * camera.depth_noticed[1], 3)),
-                    "held": self.calibration.is_held(name),
-                    "unobserved": list(camera.unobserved),
-                }
-                for name, camera in self.calibration.cameras.items()
-            },
-        }
 
 
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
@@ -138,17 +111,33 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     recorded = Estimate(corrections={camera: invert_transform(T) for camera, T in begin.items()})
     before, after = (solution.adjustment.distance(estimate) for estimate in (recorded, solution.estimate))
     twists = {camera: twist_of(begin[camera] @ solution.estimate.corrections[camera]) for camera in evidence.cameras}
-    return CalibrateResult(
-        out=out,
-        calibration=calibration,
-        moved={
-            camera: (float(np.linalg.norm(twist[3:])), float(np.degrees(np.linalg.norm(twist[:3]))))
-            for camera, twist in twists.items()
+    moved = {
+        camera: (float(np.linalg.norm(twist[3:])), float(np.degrees(np.linalg.norm(twist[:3]))))
+        for camera, twist in twists.items()
+    }
+    clock = calibration.clock
+    metrics = {
+        "frames": len(frames),
+        "distance_before_mm": None if before is None else round(1e3 * before, 2),
+        "distance_after_mm": None if after is None else round(1e3 * after, 2),
+        "clock_offset_ms": None if clock is None else round(1e3 * clock, 3),
+        "sigma_clock_ms": None if clock is None else round(1e3 * calibration.sigma_clock, 3),
+        "cameras": {
+            name: {
+                "moved_mm": round(1e3 * moved[name][0], 3),
+                "turned_deg": round(moved[name][1], 4),
+                "sigma_mm": round(1e3 * max(camera.sigma_position), 3),
+                "sigma_deg": round(float(np.degrees(max(camera.sigma_rotation))), 4),
+                "depth_scale": camera.scale,
+                "depth_bias_mm": round(1e3 * camera.bias, 3),
+                "depth_bias_noticed_mm": finite(round(1e3 * camera.depth_noticed[1], 3)),
+                "held": calibration.is_held(name),
+                "unobserved": list(camera.unobserved),
+            }
+            for name, camera in calibration.cameras.items()
         },
-        before=before,
-        after=after,
-        num_frames=len(frames),
-    )
+    }
+    return CalibrateResult(out=out, metrics=metrics, calibration=calibration, moved=moved, before=before, after=after)
 
 
 def _arm(model: RobotModel, source: FrameSource) -> Arm:

@@ -135,7 +135,6 @@ def _draw(data: Path, out: Path, threads: int) -> None:
     field_slice_picture(
         out / "field_slice.png",
         read_npz(out / "field" / "field.npz"),
-        2,
         float(np.median(centers[model.moving_spheres][-4:, 2])),
         (centers, model.sphere_set.radii),
         "distance to the map, with the arm's spheres",

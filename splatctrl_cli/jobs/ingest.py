@@ -4,10 +4,10 @@ import json
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, refuse_if
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
@@ -34,8 +34,8 @@ class IngestRequest:
     resume: bool = False
 
 
-def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, dict[str, Any]]:
-    """Write the capture, or continue an interrupted one to the same bytes; also return its metrics.
+def ingest(request: IngestRequest, progress: Progress = SILENT) -> Result:
+    """Write the capture, or continue an interrupted one to the same bytes.
 
     Raises UsageError without a camera or for another interrupted run, InputError for an unusable recording.
     """
@@ -86,4 +86,4 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> tuple[Path, d
             metrics=metrics,
             stopwatch=stopwatch,
         )
-    return out, metrics
+    return Result(out=out, metrics=metrics, document={"capture": out, **metrics})

@@ -15,15 +15,16 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if, require
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import Stopwatch, output_path, write_run
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.geometry import interpolate_transform, transform_from
 from splatctrl_cli.jobs.reconstruct.correct_views import corrected
-from splatctrl_cli.jobs.score.views import final_splats, render_with_shell
+from splatctrl_cli.jobs.score.views import render_with_shell, splats_and_shell
 from splatctrl_cli.libraries import import_extra
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
 PNG, MP4 = ".png", ".mp4"
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # [m], of T_world_camera
@@ -53,16 +54,6 @@ class RenderSceneRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderSceneResult:
-    """Number of pictures in `out`, and their size [px]."""
-
-    out: Path
-    num_pictures: int
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Track:
     """Poses T_world_camera (K, 4, 4) at ascending times (K,) [s]."""
 
@@ -78,8 +69,11 @@ class _Track:
         return interpolate_transform(self.poses[after - 1], self.poses[after], (time_s - start) / (end - start))
 
 
-def render_scene(request: RenderSceneRequest) -> RenderSceneResult:
-    """Render and write. Raises UsageError for an unknown camera, InputError for a bad path."""
+def render_scene(request: RenderSceneRequest) -> Result:
+    """Render and write; metrics: num_pictures, width and height [px].
+
+    Raises UsageError for an unknown camera, InputError for a bad path.
+    """
     scene, kind = open_scene(request.scene), request.out.suffix
     refuse_if(
         kind not in (PNG, MP4, ""),
@@ -105,7 +99,8 @@ def render_scene(request: RenderSceneRequest) -> RenderSceneResult:
             for number, image in enumerate(images):
                 (partial / f"{number:05d}{PNG}").write_bytes(_encode(image))
             write_run(partial, command="render", config={}, inputs={}, metrics={}, stopwatch=Stopwatch())
-    return RenderSceneResult(out=request.out, num_pictures=len(times), width=lens.width, height=lens.height)
+    metrics = {"num_pictures": len(times), "width": lens.width, "height": lens.height}
+    return Result(out=request.out, metrics=metrics)
 
 
 def _camera(request: RenderSceneRequest, scene: SceneFolder) -> tuple[Intrinsics, _Track]:
@@ -189,7 +184,7 @@ def _images(
     request: RenderSceneRequest, scene: SceneFolder, lens: Intrinsics, track: _Track, times: Sequence[float]
 ) -> Iterator[UInt8]:
     """Pictures (H, W, 3), RGB; of depth from red near by to blue at the first one's farthest, black without."""
-    splats_at = lru_cache(maxsize=1)(partial(_splats_at, scene))
+    splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))
     stamps, farthest = _stamps(scene), 0.0
     for time_s in times:
         stamp_ns = scene.snapshot_at(stamps[0] + round(1e9 * time_s)).stamp_ns if stamps else None
@@ -197,11 +192,6 @@ def _images(
         view, depth = render_with_shell(splats, shell, lens, track.pose(time_s), scene.background, request.threads)
         farthest = farthest or float(depth.max())
         yield _color_depth(depth, farthest) if request.depth else _quantise(view.color)
-
-
-def _splats_at(scene: SceneFolder, stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
-    splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
-    return splats, scene.shell_at(stamp_ns)
 
 
 def _quantise(color: Float32) -> UInt8:
@@ -215,7 +205,7 @@ def render_newest(scene: SceneFolder, source: FrameSource, threads: int = 0) -> 
     off, has_times = scene.run.get("metrics", {}).get("displaced_cameras") or {}, bool(_stamps(scene))
     for item in newest.values():
         frame = corrected(correct_pose(item.frame, off), scene.corrections)
-        splats, shell = _splats_at(scene, frame.stamp_ns if has_times else None)
+        splats, shell = splats_and_shell(scene, frame.stamp_ns if has_times else None)
         pose = frame.T_world_camera
         view, _ = render_with_shell(splats, shell, frame.intrinsics, pose, scene.background, threads)
         yield frame, _quantise(view.color)

@@ -67,51 +67,34 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 
 
 def field_slice_picture(
-    path: Path,
-    grid: DistanceGrid,
-    axis: int,
-    value: float,
-    spheres: tuple[Float64, Float64] | None = None,
-    title: str = "",
+    path: Path, grid: DistanceGrid, height: float, spheres: tuple[Float64, Float64], title: str
 ) -> None:
-    """Write the slice of `sdf` across `axis` (0, 1, 2) nearest to `value` [m].
+    """Write the slice of `sdf` nearest to z = `height` [m], where the channel `observed` is.
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
     as circles. Raises NotEvaluableError outside the grid.
     """
-    first, num = float(grid.origin[axis]), grid.channels["sdf"].shape[axis]
-    last = first + grid.voxel * (num - 1)
+    first, num = float(grid.origin[2]), grid.channels["sdf"].shape[2]
     refuse_if(
-        not 0 <= round((value - first) / grid.voxel) < num,
-        f"{path}: slice {'xyz'[axis]} = {value:g} m: expected {first:.3f} to {last:.3f} m",
+        not 0 <= round((height - first) / grid.voxel) < num,
+        f"{path}: slice z = {height:g} m: expected {first:.3f} to {first + grid.voxel * (num - 1):.3f} m",
         error=NotEvaluableError,
     )
-    (cut,) = _cuts(grid, [value] * 3, axes=(axis,))
+    (cut,) = _cuts(grid, [height] * 3, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
-    height = float(np.clip((WIDTH - 2.6) * sides[1] / sides[0] + 1.5, 4.5, 12.0))
-    with drawn_figure(path, height) as figure:
+    with drawn_figure(path, float(np.clip((WIDTH - 2.6) * sides[1] / sides[0] + 1.5, 4.5, 12.0))) as figure:
         axes = figure.subplots()
         image = draw_distance(axes, cut.coordinates, cut.of(grid, "sdf"), cut.voxel)
         figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
-        if "observed" in grid.channels:
-            draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
-        if spheres is not None:
-            _draw_cut_spheres(axes, spheres, cut)
-        _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
-        _label(axes, cut)
-        axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {cut.plane:.2f} m", pad=12)
-
-
-def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
-    entries = []
-    if has_spheres:
-        entries.append(
-            mpl.patches.Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane")
-        )
-    if has_observed:
-        entries.append(mpl.patches.Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
-    if entries:
+        draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
+        _draw_cut_spheres(axes, spheres, cut)
+        entries = [
+            mpl.patches.Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane"),
+            mpl.patches.Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"),
+        ]
         axes.legend(handles=entries, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
+        _label(axes, cut)
+        axes.set_title(f"{title}   z = {cut.plane:.2f} m", pad=12)
 
 
 def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], cut: Cut) -> None:

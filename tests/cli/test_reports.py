@@ -3,9 +3,12 @@ runs.
 """
 
 import ast
+import importlib
 import json
 import shutil
 from pathlib import Path
+from types import FunctionType
+from typing import get_type_hints
 
 import pytest
 from junitparser import Error, Failure, JUnitXml, TestSuite
@@ -13,7 +16,7 @@ from junitparser import Error, Failure, JUnitXml, TestSuite
 from splatctrl_cli import __version__
 from splatctrl_cli.cli import check, demo
 from splatctrl_cli.cli.commands import COMMANDS
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.jobs.demo import DemoRequest, Perform
 from tests.cli.here import splatctrl
 from tests.recording.log.make_log import LogRecipe, make_log
@@ -38,20 +41,30 @@ def suite_in(path: Path) -> TestSuite:
 
 
 def test_every_command_that_concludes_takes_junit() -> None:
-    """By the functions that call Console.concluded, themselves or through one of the same file."""
+    """By the functions that show what a job judged, themselves or through one of the same file."""
     concluding = set()
     for path in CLI.glob("*.py"):
         functions = {
             node.name: node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
         }
-        found = {name for name, node in functions.items() if ".concluded(" in ast.unparse(node)}
-        found |= {
-            name for name, node in functions.items() if any(f"{other}(" in ast.unparse(node) for other in found)
-        }
-        concluding |= {f"{path.stem}:{name}" for name in found}
+        texts = {name: ast.unparse(node) for name, node in functions.items()}
+        shows = {name for name, text in texts.items() if ".show(" in text}
+        shows |= {name for name, text in texts.items() if any(f"{other}(" in text for other in shows)}
+        concluding |= {f"{path.stem}:{name}" for name in shows if has_a_verdict(path.stem, functions[name])}
     leaves = [leaf for command in COMMANDS.values() for leaf in (command.actions or {"": command}).values()]
     assert {leaf.run for leaf in leaves if leaf.judges} == {leaf.run for leaf in leaves} & concluding
     assert sum(leaf.judges for leaf in leaves) >= 8
+
+
+def has_a_verdict(module: str, node: ast.FunctionDef) -> bool:
+    """It makes a JudgedResult, or calls a job that does."""
+    names = {
+        each.func.id for each in ast.walk(node) if isinstance(each, ast.Call) and isinstance(each.func, ast.Name)
+    }
+    found = [getattr(importlib.import_module(f"splatctrl_cli.cli.{module}"), name, None) for name in names]
+    returned = [get_type_hints(job).get("return") for job in found if isinstance(job, FunctionType)]
+    kinds = [kind for kind in returned if isinstance(kind, type)]
+    return "JudgedResult" in names or any(issubclass(kind, JudgedResult) for kind in kinds)
 
 
 def test_a_verdict_is_a_suite_of_its_recording(log: Path, tmp_path: Path) -> None:

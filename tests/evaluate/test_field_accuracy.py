@@ -37,28 +37,30 @@ SOME = np.array([True, False, True, True, True, True, True])
 def test_errors_are_counted_in_the_band_of_the_true_distance() -> None:
     error = np.array([0.001, 0.003, -0.002, 0.0, 0.02, 1.0, 1.0])
     report = field_accuracy({"hard": TRUTH + error, "gpdf": TRUTH}, TRUTH, SOME, median_radius=0.005)
-    near, middle, far, farther = report.everywhere["hard"]
-    assert (near.count, middle.count, far.count, farther.count) == (2, 1, 1, 1)
-    figures = near.mean, near.rmse, near.median, near.over_max, middle.over_max
+    near, middle, far, farther = report["everywhere"]["hard"]
+    assert [band["count"] for band in (near, middle, far, farther)] == [2, 1, 1, 1]
+    figures = near["mean"], near["rmse"], near["median"], near["over_max"], middle["over_max"]
     assert figures == pytest.approx((0.002, np.sqrt((1 + 9) / 2) * 1e-3, 0.002, 0.003, -0.002))
-    assert (report.seen["hard"][0].count, report.seen["hard"][0].over_95) == (1, pytest.approx(0.001))
-    assert report.everywhere["gpdf"][3].rmse == 0.0
+    assert (report["seen"]["hard"][0]["count"], report["seen"]["hard"][0]["over_95"]) == (1, pytest.approx(0.001))
+    assert report["everywhere"]["gpdf"][3]["rmse"] == 0.0
 
 
 def test_over_estimate_counts_seen_cells_beyond_a_centimetre_and_the_median_radius() -> None:
     """Without a word on what was seen every point counts."""
     hard = {"hard": TRUTH + np.array([0.0149, 0.5, 0.0, 0.016, 0.019, 9.0, 9.0])}
-    over = field_accuracy(hard, TRUTH, SOME, median_radius=0.005).over_estimate
-    assert (over.allowance, over.count, over.count_beyond, over.share_beyond) == (0.015, 4, 2, 0.5)
-    assert (over.median_beyond, over.max_error) == pytest.approx((0.0025, 0.019)) and not over.holds
+    report = field_accuracy(hard, TRUTH, SOME, median_radius=0.005)
+    *counted, median_beyond, max_error = report["over_estimate"].values()
+    assert counted == [0.015, 4, 2, 0.5], "allowance, count, count_beyond, share_beyond"
+    assert (median_beyond, max_error) == pytest.approx((0.0025, 0.019)) and not report["holds"]
     every = field_accuracy(hard, TRUTH, None, median_radius=0.005)
-    assert every.seen == {} and (every.over_estimate.count, every.over_estimate.count_beyond) == (5, 3)
+    assert every["seen"] == {}
+    assert (every["over_estimate"]["count"], every["over_estimate"]["count_beyond"]) == (5, 3)
 
 
 def test_bands_without_cells_have_no_figures_and_nothing_holds() -> None:
     report = field_accuracy({"hard": np.ones(1)}, np.ones(1), np.array([True]), median_radius=0.0)
-    assert report.everywhere["hard"][0].rmse is None
-    assert report.as_dict()["holds"] is False
+    assert report["everywhere"]["hard"][0]["rmse"] is None
+    assert report["holds"] is False
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError, WriteError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, read_verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Outcome, Reason, read_verdict, verdict_of
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import audit as module
-from splatctrl_cli.jobs.audit import AuditRequest, AuditResult, audit
+from splatctrl_cli.jobs.audit import AuditRequest, audit
 from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.robot import logged_robot
 from splatctrl_cli.recording.source_options import SourceOptions
@@ -71,9 +71,9 @@ class Desk:
 
     def steps_made(self, **changes: Any) -> tuple[str, ...]:
         """Steps that a call with changes makes."""
-        return self.audit(**changes).made
+        return tuple(self.audit(**changes).document["made"])
 
-    def audit(self, **changes: Any) -> AuditResult:
+    def audit(self, **changes: Any) -> JudgedResult:
         return audit(replace(self.request, **changes))
 
     def write(self, request: Any, command: str) -> None:
@@ -193,8 +193,8 @@ def test_a_log_without_joints_has_its_map_and_check_alone(desk: Desk, tmp_path: 
         "audit: NOT EVALUABLE (still.mcap): joint states: still.mcap has none, so no motion is judged, only the "
         "recording (check: passed) and its map (reconstruct: safe, scene); record /joint_states"
     )
-    assert result.made == ("check", "scene", "report")
-    assert result.verdict.sentence in result.page.read_text()
+    assert result.document["made"] == ["check", "scene", "report"]
+    assert result.verdict.sentence in result.document["page"].read_text()
 
 
 def test_spheres_are_fitted_once_where_the_urdf_has_none(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,7 +265,7 @@ def test_a_robot_by_name_is_one_of_an_installed_package(
 def test_a_verdict_is_read_as_it_was_written() -> None:
     reason = Reason(criterion="a", outcome=Outcome.FAILED, sentence="b", place=(1.0, 2.0, 3.0), label="contact")
     verdict = verdict_of("replay", [reason], scope="c", notes=["d"], is_damaged=True, counts={"e": 1})
-    assert read_verdict("replay", json.loads(json.dumps(verdict.as_dict()))).as_dict() == verdict.as_dict()
+    assert read_verdict(json.loads(json.dumps(verdict.as_dict()))).as_dict() == verdict.as_dict()
 
 
 def test_progress_names_each_step_by_its_command(desk: Desk) -> None:

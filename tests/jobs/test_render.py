@@ -13,9 +13,10 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.geometry import look_at, quat_from_rotation
 from splatctrl_cli.jobs import render as module
-from splatctrl_cli.jobs.render import RenderSceneRequest, RenderSceneResult, render_scene
+from splatctrl_cli.jobs.render import RenderSceneRequest, render_scene
 from splatctrl_cli.records import Float64
 from tests.jobs.stage import Stage, patch_json
 from tests.refused import expect_refusal
@@ -38,7 +39,7 @@ def scene(stage: Stage) -> Path:
     return replace(stage, balls=(AHEAD,), later=(ASIDE,), run={"metrics": metrics}).scene()
 
 
-def render(scene: Path, name: str = "out.png", **more: Any) -> RenderSceneResult:
+def render(scene: Path, name: str = "out.png", **more: Any) -> Result:
     return render_scene(RenderSceneRequest(scene=scene, out=scene.parent / name, threads=1, force=True, **more))
 
 
@@ -97,11 +98,11 @@ def test_along_a_path_the_camera_turns_evenly(scene: Path, tmp_path: Path, name:
     path = write_path(tmp_path / name, [0.0, 0.4], [FRONT, look_at([0.0, 0.0, 0.5], [1.0, 0.6, 0.5])])
     result = render(scene, "out", path=path, fps=5.0, depth=True)
     images = [cv2.imread(str(file)) for file in sorted(result.out.glob("*.png"))]
-    assert result.num_pictures == len(images) == 3
+    assert result.metrics["num_pictures"] == len(images) == 3
     middles = [np.mean(columns(np.asarray(image) / 255)) for image in images]
     assert middles[0] == pytest.approx(31.5, abs=1.0) and middles[0] < middles[1] < middles[2]
     assert json.loads((result.out / "run.json").read_text())["command"] == "render"
-    assert render(scene, "out.png", path=path).num_pictures == 1
+    assert render(scene, "out.png", path=path).metrics["num_pictures"] == 1
 
 
 def test_a_camera_moves_as_in_the_recording(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +131,7 @@ def test_a_video_has_a_picture_for_each_time(scene: Path, capsys: pytest.Capture
 
 def test_a_scene_without_times_has_one_picture(scene: Path) -> None:
     patch_json(scene / "run.json", lambda run: run | {"metrics": run["metrics"] | {"has_clock": False}})
-    assert render(scene, "still").num_pictures == 1
+    assert render(scene, "still").metrics["num_pictures"] == 1
     expect_refusal("--at 0.5: .* has no times; leave it out", render, scene, at=0.5, error=UsageError)
 
 

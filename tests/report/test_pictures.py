@@ -93,8 +93,7 @@ CURVE = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empt
 
 DRAWN: dict[str, Callable[[Path], None]] = {
     "comparison": lambda path: comparison_picture(path, [row(0.0), row(0.1)]),
-    "slice": lambda path: field_slice_picture(path, grid(), 2, 0.5, SPHERES, "A ball"),
-    "plain slice": lambda path: field_slice_picture(path, grid(), 2, 0.5),
+    "slice": lambda path: field_slice_picture(path, grid(), 0.5, SPHERES, "A ball"),
     "slices": lambda path: slices_picture(path, grid(), MIDDLE),
     "slices of nothing": lambda path: slices_picture(path, grid(distance=np.nan), MIDDLE),
     "large slices": lambda path: slices_picture(path, LARGE, (0.5, 0.0, 0.0)),
@@ -154,8 +153,8 @@ def test_never_seen_space_shows_in_a_slice_where_somebody_looked_and_the_point_t
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.png"
-    field_slice_picture(path, grid(observed=0), 2, 0.5)
-    assert path.read_bytes() != drawn_bytes("plain slice")
+    field_slice_picture(path, grid(observed=0), 0.5, SPHERES, "A ball")
+    assert path.read_bytes() != drawn_bytes("slice")
     never, unknown = grid(observed=0), grid(observed=0, header="no occupancy grid: all never seen")
     others = []
     for cells, place in ((never, MIDDLE), (unknown, MIDDLE), (grid(), (0.0, 0.0, 0.0))):
@@ -169,7 +168,7 @@ def test_a_sphere_is_drawn_as_the_circle_of_the_cut(tmp_path: Path) -> None:
     areas = []
     for height in (0.5, 0.58, 0.8):
         sphere = np.array([[0.2, 0.2, height]]), np.array([0.1])
-        field_slice_picture(tmp_path / "a.png", grid(), 2, 0.5, sphere)
+        field_slice_picture(tmp_path / "a.png", grid(), 0.5, sphere, "A ball")
         areas.append(num_orange(picture(tmp_path / "a.png")))
     whole, small = areas[0] - areas[2], areas[1] - areas[2]
     assert whole > 1000
@@ -314,7 +313,10 @@ def test_bins_hold_what_they_say() -> None:
 @pytest.mark.parametrize(
     ("draw", "words"),
     [
-        (lambda path: field_slice_picture(path, grid(), 2, 2.0), r"slice z = 2 m: expected 0\.000 to 0\.950 m"),
+        (
+            lambda path: field_slice_picture(path, grid(), 2.0, SPHERES, "A ball"),
+            r"slice z = 2 m: expected 0\.000 to 0\.950 m",
+        ),
         (lambda path: comparison_picture(path, []), "no view to draw"),
         (lambda path: reliability(np.empty(0), np.empty(0, bool)), "at least one point"),
         (

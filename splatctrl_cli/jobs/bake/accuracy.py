@@ -92,7 +92,7 @@ def _compare_with_truth(
 
 
 def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """Values of hard and sdf at drawn cells; a whole channel may not fit in memory."""
+    """Values of hard and sdf at drawn cells."""
     channels: dict[str, NDArray[np.generic]] = {
         name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
         for name in ("sdf", "hard", "bound")
@@ -111,7 +111,7 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
-    """Compare with the newest held-out depth up to the scene's stamp, without the robot and outside the box."""
+    """Compare with the newest held-out depth up to the scene's stamp."""
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
     newest: dict[str, tuple[RgbdFrame, JointState | None]] = {}

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
+from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names
 from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.clusters import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
@@ -141,25 +141,11 @@ def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection
         check_room("format vdb:", 7 * bytes_per_cell(channels) * layout.num_cells, remedy)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BakeResult:
-    """A baked field in `out`; metrics can be gated on, seconds are by stage.
+def bake(request: BakeRequest, progress: Progress = SILENT) -> JudgedResult:
+    """Bake into the output folder, or continue an interrupted bake. Raises SplatCtrlError.
 
-    accuracy: by reference (truth, reference_mesh, held_out_depth), as in ``field.json``.
+    Document: a summary, and the accuracy by reference (truth, reference_mesh, held_out_depth), as in ``field.json``.
     """
-
-    __repr__ = brief
-
-    out: Path
-    summary: Mapping[str, Any]
-    accuracy: Mapping[str, Mapping[str, Any]]
-    metrics: Mapping[str, float | None]
-    verdict: Verdict
-    seconds: Mapping[str, float]
-
-
-def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
-    """Bake into the output folder, or continue an interrupted bake. Raises SplatCtrlError."""
     check_request(request)
     stopwatch, out = Stopwatch(), request.out
     checkpoint = partial_path(out) / CHECKPOINT
@@ -201,9 +187,8 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    return BakeResult(
-        out=out, summary=summary, accuracy=accuracy, metrics=metrics, verdict=verdict, seconds=stopwatch.seconds
-    )
+    document = {**summary, **({"accuracy": accuracy} if accuracy else {})}
+    return JudgedResult(out=out, metrics=metrics, document=document, verdict=verdict, seconds=stopwatch.seconds)
 
 
 def check_request(request: BakeRequest) -> None:

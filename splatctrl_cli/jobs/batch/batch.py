@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import DAMAGED, UsageError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, plural, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Outcome, Reason, Verdict, plural, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batch.graph import COMMANDS, CommandLine, Node, nodes_of, select_shard
 from splatctrl_cli.jobs.batch.ledger import FILE, FILE_VERSION, FORMAT, Ledger, Run, keys_of
@@ -51,8 +51,8 @@ class BatchRequest:
     again: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class BatchResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class BatchResult(JudgedResult):
     """Runs of all nodes in graph order; num_kept of them from before."""
 
     out: Path
@@ -60,7 +60,6 @@ class BatchResult:
     jobs: Sequence[str]
     runs: Sequence[Run]
     num_kept: int
-    verdict: Verdict
 
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
@@ -80,8 +79,10 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
         finally:
             if scheduler.keys:  # it knows what each node is to be
                 write_batch(out, suite, every, ledger.latest(), scheduler.keys)
+    document = {"out": out, "suite": suite.name, "kept": scheduler.num_kept}
     return BatchResult(
         out=out,
+        document=document | {"nodes": [run.document() for run in runs]},
         suite=suite.name,
         jobs=[job.name for job in suite.jobs],
         runs=runs,

@@ -9,10 +9,10 @@ from typing import Any
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, failed, lacking, note, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, failed, lacking, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
-    Judged,
     JudgedRun,
+    JudgedRuns,
     WorstState,
     read_baseline,
     read_judged,
@@ -89,24 +89,20 @@ class JobChange:
     worst: FigureChange
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CompareResult(JudgedResult):
     """Changes of figures, verdicts and jobs, regressions first.
 
     verdicts: run, recording, change, and labels before and after. jobs: over enough recordings, which decide in place
     of figures. differences: settings, versions and inputs, before and after. only_before: not compared.
     """
 
-    __repr__ = brief
-
-    verdict: Verdict
     verdicts: tuple[Mapping[str, str], ...]
     figures: tuple[FigureChange, ...]
     jobs: tuple[JobChange, ...]
     differences: Mapping[str, tuple[str, str]]
     only_after: tuple[str, ...]
     only_before: tuple[str, ...] = ()
-    metrics: Mapping[str, int]
     baseline: Path | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -151,10 +147,11 @@ def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResu
     if request.update_baseline is not None:
         write_baseline(request.update_baseline, after)
         progress.log(f"wrote {request.update_baseline}")
-    return replace(result, baseline=request.update_baseline)
+    result = replace(result, baseline=request.update_baseline)
+    return replace(result, document=result.as_dict())
 
 
-def _check_alike(before: Judged, after: Judged) -> None:
+def _check_alike(before: JudgedRuns, after: JudgedRuns) -> None:
     refuse_if(
         before.kind != after.kind, f"{after.path}: expected a {before.kind} like {before.path}, got a {after.kind}"
     )
@@ -184,7 +181,7 @@ def _check_alike(before: Judged, after: Judged) -> None:
         )
 
 
-def _compare(before: Judged, after: Judged) -> CompareResult:
+def _compare(before: JudgedRuns, after: JudgedRuns) -> CompareResult:
     pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
     only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
@@ -307,7 +304,7 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
         )
 
 
-def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: Judged) -> Iterator[Reason]:
+def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: JudgedRuns) -> Iterator[Reason]:
     for one in verdicts:
         name = f"verdict of {one['run']}"
         words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"

@@ -75,7 +75,7 @@ class JudgedRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
+class JudgedRuns:
     """Runs to compare, by name; kind: "run" (a single one) or "batch"."""
 
     path: Path
@@ -84,7 +84,7 @@ class Judged:
     is_baseline: bool = False
 
 
-def read_judged(path: Path) -> Judged:
+def read_judged(path: Path) -> JudgedRuns:
     """Read the folder of a judging command, an audit's steps, or a batch. Raises InputError for others."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
@@ -94,7 +94,7 @@ def read_judged(path: Path) -> Judged:
         remedy="wait for it, or run it again",
     )
     if has_batch:
-        return Judged(path=path, kind="batch", runs={run.name: run for run in _nodes_of(open_batch(path))})
+        return JudgedRuns(path=path, kind="batch", runs={run.name: run for run in _nodes_of(open_batch(path))})
     what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
     refuse_if(not has_run, f"{path}: expected the output folder of a command or a batch, got {what}")
     run = open_run(path)
@@ -108,7 +108,7 @@ def read_judged(path: Path) -> Judged:
         remedy=f"give one of {', '.join(scales())}, {AUDIT}",
     )
     recording = path.absolute().name
-    return Judged(
+    return JudgedRuns(
         path=path,
         kind="run",
         runs={
@@ -179,7 +179,7 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     yield from ((f"input {name}", str(digest)[:12]) for name, digest in (document.get("inputs") or {}).items())
 
 
-def read_baseline(path: Path) -> Judged:
+def read_baseline(path: Path) -> JudgedRuns:
     """Read a baseline. Raises InputError for another or newer file, or unknown figures."""
     make = "make one with --update-baseline"
     with (
@@ -216,10 +216,10 @@ def read_baseline(path: Path) -> Judged:
                 settings={"splatctrl": version},
                 **one,
             )
-    return Judged(path=path, kind=kind, runs=runs, is_baseline=True)
+    return JudgedRuns(path=path, kind=kind, runs=runs, is_baseline=True)
 
 
-def write_baseline(path: Path, judged: Judged) -> None:
+def write_baseline(path: Path, judged: JudgedRuns) -> None:
     """Write the figures that have a direction, sorted, one a line.
 
     Raises UsageError if `path` is another file.

@@ -6,7 +6,7 @@ Written splats are read back and rendered before they count.
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
 from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError, refuse_if, require
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import finite, output_path, sha256
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import Snapshot, open_scene
@@ -47,7 +48,6 @@ from splatctrl_cli.jobs.runs.run_folder import (
     FolderRequest,
     RunFolder,
     States,
-    WrittenFile,
     open_run,
     sibling_path,
 )
@@ -74,36 +74,13 @@ class ExportRequest:
     force: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportResult:
-    """The written file and its differences from the source.
-
-    origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside: Gaussians
-    clamped to the range. allowed: the format's rounding. Over all views: largest_pixel_difference in colour, opacity,
-    or depth over scene size; psnr [dB], None if equal; covered_share. isotropic_psnr [dB]: of the rounded splats.
-    """
-
-    file: Path
-    format: str
-    bytes: int
-    sha256: str
-    num_splats: int
-    num_left_out: int
-    origin: str | None = None
-    not_kept: tuple[str, ...]
-    num_outside: int
-    differences: Differences
-    allowed: Differences
-    num_views_compared: int = EXPORT_VIEWS
-    largest_pixel_difference: float
-    psnr: float | None
-    covered_share: float
-    isotropic_psnr: float | None
-    was_rounded: bool
-
-
-def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
+def export(request: ExportRequest, progress: Progress = SILENT) -> Result:
     """Write the splats, read them back and compare.
+
+    Metrics: origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside:
+    Gaussians clamped to the range. differences; allowed: the format's rounding. Over all views:
+    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share.
+    isotropic_psnr [dB]: of the rounded splats.
 
     Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
     errors above the format's rounding.
@@ -146,24 +123,38 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
         found = _check_differences(out, held, after, bound, exact)
         largest, psnr, covered = _check_look(out, kind, chosen, back)
-        return ExportResult(
-            file=out,
-            format=kind.name,
-            bytes=partial.stat().st_size,
-            sha256=sha256(partial),
-            num_splats=len(chosen),
-            num_left_out=len(splats) - len(chosen),
-            origin=comments.get(ORIGIN),
-            not_kept=(*_not_kept(chosen, back, held), *({ORIGIN} & comments.keys() - said.keys())),
-            num_outside=_num_outside(before, held),
-            differences=found,
-            allowed=bound,
-            largest_pixel_difference=largest,
-            psnr=psnr,
-            covered_share=covered,
-            isotropic_psnr=None if chosen is selected else _look(selected, chosen)[1],
-            was_rounded=chosen is not selected,
-        )
+        rounded = None if chosen is selected else _look(selected, chosen)[1]
+        origin, num_outside = comments.get(ORIGIN), _num_outside(before, held)
+        not_kept = (*_not_kept(chosen, back, held), *({ORIGIN} & comments.keys() - said.keys()))
+        metrics = {
+            "format": kind.name,
+            "bytes": partial.stat().st_size,
+            "sha256": sha256(partial),
+            "num_splats": len(chosen),
+            "num_left_out": len(splats) - len(chosen),
+            "origin": origin,
+            "not_kept": not_kept,
+            "num_outside": num_outside,
+            "differences": asdict(found),
+            "allowed": asdict(bound),
+            "num_views_compared": EXPORT_VIEWS,
+            "largest_pixel_difference": largest,
+            "psnr": psnr,
+            "covered_share": covered,
+            "isotropic_psnr": rounded,
+        }
+    texts = {
+        f"made isotropic: {decibels(rounded)} against the source": chosen is not selected,
+        f"centres are less the origin {origin} m: float32 would move them without": origin,
+        f"not kept: {', '.join(not_kept)}": not_kept,
+        f"{num_outside} splats have a size or colour beyond the format's range: put at its edge": num_outside,
+    }
+    notes = tuple(text for text, holds in texts.items() if holds)
+    return Result(out=out, metrics=metrics, notes=notes, document={"file": out, **metrics})
+
+
+def decibels(psnr: float | None) -> str:
+    return "the same" if psnr is None else f"PSNR {psnr:.1f} dB"
 
 
 def _splat_file(scene: Path) -> Path:
@@ -287,22 +278,19 @@ class ExportRunRequest(FolderRequest):
     """One export of a replay, scene or field folder to MCAP; out: None for PATH.mcap."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportRunResult(WrittenFile):
-    """The file, and its messages by topic."""
+def export_run(request: ExportRunRequest) -> Result:
+    """Write the MCAP; metrics: bytes, messages by topic.
 
-    messages: dict[str, int]
-
-
-def export_run(request: ExportRunRequest) -> ExportRunResult:
-    """Write the MCAP. Raises InputError for another folder, UsageError for a missing library."""
+    Raises InputError for another folder, UsageError for a missing library.
+    """
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
     out = request.out or sibling_path(request.path.absolute(), ".mcap")
     with output_path(out, force=request.force, is_folder=False) as written:
         with foxglove_log(written) as log:
             for _, _, write in parts:
                 write(log)
-        return ExportRunResult(file=out, bytes=written.stat().st_size, messages=dict(log.counts))
+        metrics = {"bytes": written.stat().st_size, "messages": dict(log.counts)}
+    return Result(out=out, metrics=metrics, document={"file": out, **metrics})
 
 
 def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:

@@ -15,6 +15,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_TABLE, MARCH_STEPS
 from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
@@ -211,23 +212,12 @@ class QueryRequest(RunOptions):
     labels: frozenset[Label] = DEFAULT_LABELS
 
 
-@dataclass(frozen=True, kw_only=True)
-class QueryResult:
-    """A query's figures; kind: scene, field, or field and scene.
-
-    metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
-    min_distance, mean_distance, min_bound [m]; None if unknown.
-    """
-
-    out: Path | None
-    kind: str
-    metrics: Mapping[str, float | None]
-    notes: tuple[str, ...]
-    seconds: Mapping[str, float]
-
-
-def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
+def query(request: QueryRequest, progress: Progress = SILENT) -> Result:
     """Answer the points, and write the answers to `out`.
+
+    Metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
+    min_distance, mean_distance, min_bound [m]; None if unknown. The document's source: scene, field, or field and
+    scene.
 
     Raises SplatCtrlError, leaving no file, for an unreadable source or table.
     """
@@ -248,13 +238,9 @@ def query(request: QueryRequest, progress: Progress = SILENT) -> QueryResult:
                 if out is not None:
                     out.write(rows_of(points, answers))
     metrics = _metrics_of(figures)
-    return QueryResult(
-        out=request.out,
-        kind=kind,
-        metrics=metrics,
-        notes=_notes_of(kind, box, metrics),
-        seconds=stopwatch.seconds,
-    )
+    notes, out_name = _notes_of(kind, box, metrics), None if request.out is None else str(request.out)
+    document = {"out": out_name, "source": kind, **metrics, "notes": notes}
+    return Result(out=request.out, metrics=metrics, document=document, notes=notes, seconds=stopwatch.seconds)
 
 
 Answering = tuple[str, Callable[[Float64], Answers], Box | None, Device | None]

@@ -12,7 +12,7 @@ from splatctrl_cli.calibration.displacement import correct_pose, displaced_camer
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
 from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names, plural
+from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names, plural
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
 from splatctrl_cli.formats.scene.scene_folder import SELF_MODEL
@@ -38,21 +38,11 @@ from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReconstructResult:
-    """The scene folder, metrics, verdict, removed splats by reason, and seconds by stage."""
+def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> JudgedResult:
+    """Reconstruct into the output folder, or continue an interrupted run. Raises SplatCtrlError.
 
-    __repr__ = brief
-
-    out: Path
-    metrics: Mapping[str, Any]
-    verdict: Verdict
-    removed: Mapping[str, int]
-    seconds: Mapping[str, float]
-
-
-def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> ReconstructResult:
-    """Reconstruct into the output folder, or continue an interrupted run. Raises SplatCtrlError."""
+    Document: scene, metrics, and removed splats by reason.
+    """
     check_gate_names(request.require, GATED)
     training_cameras(request.source)
     device = FitDevice(request.device)
@@ -107,11 +97,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    return ReconstructResult(
+    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
+    return JudgedResult(
         out=request.out,
         metrics=made.metrics,
+        document={"scene": request.out, "metrics": made.metrics, "removed": removed},
         verdict=verdict,
-        removed={name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed},
         seconds=stopwatch.seconds,
     )
 

@@ -406,7 +406,7 @@ class Reconstruction:
         return posture_of(robot, robot.positions_of(names, step.position), at_frames, carried)
 
     def _seconds(self, stamp_ns: int) -> float:
-        """Time since the first joint state, which precedes steps with a posture."""
+        """Time [s] since the first joint state."""
         assert self._first_state_ns is not None
         return (stamp_ns - self._first_state_ns) * 1e-9
 

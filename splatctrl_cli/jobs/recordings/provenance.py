@@ -176,7 +176,7 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Describe how a scene's robot differs from a model, or empty; links of the model alone do not count."""
+    """Difference of a scene's robot from a model in words, or empty."""
     joints = made_from.get("robot_joints")
     if joints is None:
         return ""

@@ -1,8 +1,8 @@
 """Criteria of the evidence behind a replay's verdict."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -19,142 +19,100 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, lacking, passed_reason
+from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, lacking, passed_reason
 from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
-from splatctrl_cli.jobs.replay.criteria import (
-    MARGIN,
-    UNKNOWN,
-    Judged,
-    clocks,
-    evidence_age,
-    judged_time,
-    map_age,
-    mm,
-    nearby,
-)
+from splatctrl_cli.jobs.replay.criteria import MARGIN, UNKNOWN, Bound, Judged, mm
 from splatctrl_cli.jobs.replay.request import OCCUPIED
-from splatctrl_cli.jobs.replay.trace import Trace
-from splatctrl_cli.records import Float64
+from splatctrl_cli.jobs.replay.time_criteria import CLOCKS, evidence_age, judged_time, map_age
 from splatctrl_cli.voxels import EvidenceClass
 
-
-@dataclass(frozen=True, kw_only=True)
-class Limit:
-    """A row of the evidence table; column: of `NEAR_COLUMNS`, for `parts` the least.
-
-    most: largest share allowed; least [m]: distance to exceed (0: the margin). For the documentation, asked: the
-    quantity; why: the reason.
-    """
-
-    asked: str
-    why: str
-    column: str
-    parts: tuple[EvidenceClass, ...] = ()
-    most: float | None = None
-    least: float = 0.0
-    words: str
-    remedy: str
-
-    @property
-    def name(self) -> str:
-        return self.parts[0].name.lower() if self.parts else self.column
-
-    def values(self, near: Trace) -> Float64:
-        """The limited column (T,); NaN where space about the arm was not evaluated."""
-        values: Float64 = near[self.column]
-        return values[:, self.parts].min(axis=1) if self.parts else values
-
-    def is_broken(self, near: Trace, margin: float) -> bool:
-        """True if any state breaks it; margin [m]."""
-        values = self.values(near)
-        return bool(np.any(values <= (self.least or margin)) if self.most is None else np.any(values > self.most))
-
-    @property
-    def docs(self) -> str:
-        """Row of the documentation's table, its cells separated by |."""
-        within = f"at most {100 * self.most:g} %" if self.most is not None else ""
-        distance = f"more than {1e3 * self.least:g} mm" if self.least else "more than the margin"
-        return f"{self.asked} | {within or distance} | {self.why}"
-
-
 LIMITS = (
-    Limit(
-        asked="never seen, of all points within the margin",
+    Bound(
+        quantity="never seen, of all points within the margin",
         why="correct recordings of three cameras leave up to 49 %; what this limit alone rejects leaves 50 % or more",
-        column="unseen",
-        most=UNSEEN,
-        words="of the space within the margin of the arm was never seen",
+        on="unseen",
+        at_most=UNSEEN,
+        say="{percent:.0f} % of the space within the margin of the arm was never seen, allowed {allowed_percent:g} %",
+        kept="{percent:.0f} % of the space within the margin of the arm was never seen",
         remedy="add a camera that sees where the arm goes",
     ),
-    Limit(
-        asked="path from a surface of the map to the arm, by a point never seen",
+    Bound(
+        quantity="path from a surface of the map to the arm, by a point never seen",
         why="an object may extend into space on its unseen side",
-        column="unseen_path",
-        least=UNSEEN_PATH,
-        words="a surface of the map is {} from the arm by a path over unseen space, allowed {allowed}: it may extend "
-        "there",
+        on="unseen_path",
+        unit="m",
+        above=UNSEEN_PATH,
+        say="a surface of the map is {mm} from the arm by a path over unseen space, allowed {allowed_mm}: it may "
+        "extend there",
         remedy="add a camera that sees that side",
     ),
-    Limit(
-        asked="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+    Bound(
+        quantity="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
         why="space that is almost entirely unseen may hold a whole object",
-        column="blind_to_surface",
-        least=BEYOND,
-        words="a part of the arm enters space that is over 90 % unseen, {} from a surface of the map, allowed "
-        "{allowed}: the surface may extend there",
+        on="blind_to_surface",
+        unit="m",
+        above=BEYOND,
+        say="a part of the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed "
+        "{allowed_mm}: the surface may extend there",
         remedy="add a camera that sees where the arm goes",
     ),
-    Limit(
-        asked="unanswered, from the arm",
+    Bound(
+        quantity="unanswered, from the arm",
         why="a dark, shiny or transparent object returns no depth where depth is expected",
-        column="class_distance",
+        on="class_distance",
+        unit="m",
         parts=(EvidenceClass.UNANSWERED,),
-        words="cameras got no depth from a place {} from the arm, margin {allowed}",
+        say="cameras got no depth from a place {mm} from the arm, margin {allowed_mm}",
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
-    Limit(
-        asked="contradicted, from the arm",
+    Bound(
+        quantity="contradicted, from the arm",
         why="depth of a shiny object may lie far behind it",
-        column="class_distance",
+        on="class_distance",
+        unit="m",
         parts=(EvidenceClass.CONTRADICTED,),
-        words="{} from the arm, margin {allowed}, one camera measures depth behind a surface that another one sees",
+        say="{mm} from the arm, margin {allowed_mm}, one camera measures depth behind a surface that another one "
+        "sees",
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
-    Limit(
-        asked="depth edge, from the arm",
+    Bound(
+        quantity="depth edge, from the arm",
         why="a surface may extend one pixel past an edge without depth",
-        column="class_distance",
+        on="class_distance",
+        unit="m",
         parts=(EvidenceClass.DEPTH_EDGE,),
-        words="a depth edge was lost {} from the arm, margin {allowed}: the surface may extend one pixel further",
+        say="a depth edge was lost {mm} from the arm, margin {allowed_mm}: the surface may extend one pixel further",
         remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
     ),
-    Limit(
-        asked="outside of the workspace, from the arm",
+    Bound(
+        quantity="outside of the workspace, from the arm",
         why="the map ends there",
-        column="class_distance",
+        on="class_distance",
+        unit="m",
         parts=(EvidenceClass.OUTSIDE,),
-        words="the workspace of the map ends {} from the arm, margin {allowed}",
+        say="the workspace of the map ends {mm} from the arm, margin {allowed_mm}",
         remedy="reconstruct with a larger --box",
     ),
 )
 BY_FEW = {
     num: replace(
         LIMITS[0],
-        asked=f"never seen by {cameras}, of all points within the margin",
+        quantity=f"never seen by {cameras}, of all points within the margin",
         why=f"the far side of the arm may hide a whole object from {them}",
-        most=most,
+        at_most=most,
     )
     for num, cameras, them, most in (
         (2, "two cameras", "them", UNSEEN_BY_TWO),
         (1, "a lone camera", "it", UNSEEN_BY_ONE),
     )
 }
-PROOF = Limit(
-    asked="not free, with `--require-proof` or `--unseen occupied`, from the arm",
+PROOF = Bound(
+    quantity="not free, with `--require-proof` or `--unseen occupied`, from the arm",
     why="such a run would be safe by assumption",
-    column="class_distance",
+    on="class_distance",
+    unit="m",
     parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
-    words="space not seen free within the allowed age is {} from the arm, margin {allowed}",
+    say="space not seen free within the allowed age is {mm} from the arm, margin {allowed_mm}",
     remedy="add cameras until they see every side of the arm",
 )
 
@@ -165,76 +123,31 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     """
     first = BY_FEW.get(len(judged.inputs.scene.cameras or ()), LIMITS[0])
     for limit in (first, *LIMITS[1:]):
-        yield from _check_limit(judged, limit)
-    if judged.request.unseen == OCCUPIED:
-        yield from _check_limit(judged, PROOF, partial(failed, label=MARGIN))
-    elif judged.request.require_proof:
-        yield from _check_limit(judged, PROOF)
-    yield from _unknown_share(judged)
-
-
-def _check_limit(judged: Judged, limit: Limit, broken: Callable[..., Reason] = lacking) -> Iterator[Reason]:
-    near = judged.replay.trace
-    values = limit.values(near)
-    if limit is PROOF and np.isnan(near["assumed"]).all():
-        yield lacking(sentence="evidence of the space near the arm is not recorded")
-    if limit.most is not None:
-        worst = nearby(near, limit.column)
-        if worst is None:
-            return
-        words = f"{100 * worst[0]:.0f} % {limit.words}"
-        if not limit.is_broken(near, judged.replay.margin):
-            yield passed_reason(words, worst[0], limit.most, "", worst[2])
-            return
-        yield broken(
-            sentence=f"{words}, allowed {100 * limit.most:g} %",
-            value=worst[0],
-            threshold=limit.most,
-            time_s=worst[1],
-            remedy=limit.remedy,
-            count=worst[2],
-        )
-        return
-    if not limit.is_broken(near, judged.replay.margin):
-        return
-    at, allowed = int(np.nanargmin(values)), limit.least or judged.replay.margin
-    if limit.parts:
-        nearest = min(limit.parts, key=lambda kind: float(near["class_distance"][at, kind]))
-        place = near["class_places"].reshape(len(values), -1, 3)[at, nearest]
-    else:
-        place = near[f"{limit.column}_place"][at]
-    yield broken(
-        sentence=limit.words.format(mm(values[at]), allowed=mm(allowed)),
-        value=float(values[at]),
-        threshold=allowed,
-        unit="m",
-        time_s=judged.replay.trace.seconds(at),
-        place=tuple(place.tolist()),
-        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*place),
-        remedy=limit.remedy,
-        count=int((values <= allowed).sum()),
-    )
-
-
-def _unknown_share(judged: Judged) -> Iterator[Reason]:
-    share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
-    if share is None:
+        yield from limit(judged)
+    if (is_occupied := judged.request.unseen == OCCUPIED) or judged.request.require_proof:
+        if np.isnan(judged.replay.trace["assumed"]).all():
+            yield lacking(sentence="evidence of the space near the arm is not recorded")
+        proof = replace(PROOF, outcome=Outcome.FAILED, label=MARGIN) if is_occupied else PROOF
+        yield from proof(judged)
+    if judged.metrics["unknown_share"] is None:
         yield lacking(sentence="the space that cameras saw is not recorded")
-    elif share <= allowed:
-        yield passed_reason(
-            f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.replay.num_states
-        )
-    else:
-        at = int(np.argmax(judged.replay.trace["unknown_share"] > allowed))
-        yield lacking(
-            sentence=f"{100 * share:.1f} % of the sphere centres lie in unseen space, allowed {100 * allowed:g} %, "
-            "first",
-            value=share,
-            threshold=allowed,
-            time_s=judged.replay.trace.seconds(at),
-            remedy="add a camera, or give a larger --max-unknown",
-            count=judged.replay.num_states,
-        )
+    yield from UNKNOWN_SHARE(judged)
+
+
+def _unknown_share(judged: Judged) -> Reason:
+    """The mean share, at the first state above the allowed one."""
+    trace, share = judged.replay.trace, judged.metrics["unknown_share"]
+    first_s = trace.seconds(int(np.argmax(trace["unknown_share"] > judged.request.max_unknown)))
+    return lacking(sentence="", value=share, time_s=first_s, count=judged.replay.num_states)
+
+
+UNKNOWN_SHARE = Bound(
+    on=_unknown_share,
+    at_most=attrgetter("request.max_unknown"),
+    say="{percent:.1f} % of the sphere centres lie in unseen space, allowed {allowed_percent:g} %, first",
+    kept="{percent:.2g} % of sphere centres in unseen space",
+    remedy="add a camera, or give a larger --max-unknown",
+)
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
@@ -344,27 +257,32 @@ def map_resolution(judged: Judged) -> Iterator[Reason]:
     """Voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
     the margin: an obstacle touching the robot may go unseen that far.
     """
-    figures, margin = judged.inputs.scene.figures(), judged.replay.margin
-    voxel, by_link = figures.get("voxel"), figures.get("self_mask")
-    if voxel is not None and voxel > COARSE_VOXEL:
-        yield lacking(
-            sentence=f"the map has voxels of {mm(voxel)}, allowed {mm(COARSE_VOXEL)} beside a robot",
-            value=float(voxel),
-            threshold=COARSE_VOXEL,
-            unit="m",
-            remedy="reconstruct with --urdf, or with --set scene.scale=1",
-        )
-    reaches = {link: 1e-3 * row.get("reach_mm", 0.0) for link, row in (by_link or {}).items()}
-    blind = max(reaches, key=reaches.__getitem__, default=None)
-    if blind is not None and reaches[blind] > margin:
-        yield lacking(
-            sentence=f"surfaces within {mm(reaches[blind])} of {blind} count as the robot, margin {mm(margin)}",
-            value=reaches[blind],
-            threshold=margin,
-            unit="m",
-            who=blind,
-            remedy="lower occupancy.self_mask_tolerance or occupancy.depth_error, or place a camera nearer",
-        )
+    yield from VOXEL(judged)
+    yield from BLIND(judged)
+
+
+def _blind_link(judged: Judged) -> Reason:
+    """The link whose mask reaches farthest [m]."""
+    by_link = judged.inputs.scene.figures().get("self_mask") or {}
+    reaches = {link: 1e-3 * row.get("reach_mm", 0.0) for link, row in by_link.items()}
+    blind = max(reaches, key=reaches.__getitem__, default="")
+    return lacking(sentence="", value=reaches.get(blind), who=blind)
+
+
+VOXEL = Bound(
+    on=lambda judged: lacking(sentence="", value=judged.inputs.scene.figures().get("voxel")),
+    at_most=COARSE_VOXEL,
+    unit="m",
+    say="the map has voxels of {mm}, allowed {allowed_mm} beside a robot",
+    remedy="reconstruct with --urdf, or with --set scene.scale=1",
+)
+BLIND = Bound(
+    on=_blind_link,
+    at_most=attrgetter("replay.margin"),
+    unit="m",
+    say="surfaces within {mm} of {who} count as the robot, margin {allowed_mm}",
+    remedy="lower occupancy.self_mask_tolerance or occupancy.depth_error, or place a camera nearer",
+)
 
 
 OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
@@ -376,5 +294,10 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="known space", find=known_space, broken=UNKNOWN),
     Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
     Criterion(name="map age", find=map_age, broken=f"{UNKNOWN}; *contact* or *margin broken* by its own depth"),
-    Criterion(name="clocks", find=clocks, broken=UNKNOWN),
+    Criterion(
+        name="clocks",
+        find=CLOCKS,
+        asked="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
+        broken=UNKNOWN,
+    ),
 )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind, first_intervention
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, UNITS, Event, EventKind, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
@@ -28,10 +28,6 @@ from splatctrl_cli.report.replay_pictures import (
 )
 from splatctrl_cli.robot.sphere_files import sphere_names
 
-UNITS = {
-    **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
-    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s", "row-broken": "m/s"},
-}
 _SPECIAL = re.compile('[,"\r\n]')
 
 COLUMNS = (  # of the trace in steps.csv, after stamps and clearances; a column per joint for rows (T, J)
@@ -88,7 +84,7 @@ def write_replay(
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
     if replay.separation is not None:
-        write_json(folder / "separation.json", separation_document(replay.separation))
+        write_json(folder / "separation.json", separation_document(replay, metrics))
     write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay)
@@ -158,7 +154,7 @@ def describe_event(event: Event, *, with_kind: bool = True) -> str:
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""
     near = "" if event.obstacle is None else f", near {event.obstacle}"
-    is_row = event.kind in ("scene", "self", "limit")
+    is_row = event.kind in ROWS
     kind = f"{event.kind} row" if is_row else event.kind if with_kind else ""
     who = " ".join(filter(None, (kind, event.worst_name)))
     worst = f"{'multiplier ' if is_row else ''}{event.worst:.4g} {unit}".rstrip()

@@ -238,13 +238,7 @@ def check_controller(request: ReplayRequest) -> None:
 
 @contextmanager
 def commander_of(
-    request: ReplayRequest,
-    inputs: ReplayInputs,
-    config: ControlConfig,
-    console: Progress,
-    *,
-    frame: str,
-    home: Float64 | None,
+    request: ReplayRequest, inputs: ReplayInputs, console: Progress, *, frame: str, home: Float64 | None
 ) -> Iterator[Commander]:
     """Start our controller or the user's, which ends with the block.
 
@@ -255,8 +249,9 @@ def commander_of(
         return
     name, connect = _connector(request, inputs)
     console.log(f"replay: starting the controller {name}")
+    control, is_twice = request.config.control, request.controller_twice
     with OutsideController(
-        name, connect, inputs.model, config, frame=frame, home=home, is_twice=request.controller_twice
+        name, connect, inputs.model, control, frame=frame, home=home, is_twice=is_twice
     ) as outside:
         yield outside
         if outside.num_answers:

@@ -32,23 +32,23 @@ from splatctrl_cli.planner.planned import planned_detours
 from splatctrl_cli.records import Float64, Stamps
 
 
-def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
+def replayed(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
     mode = {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode]
-    return mode(request, inputs, config, console)
+    return mode(request, inputs, console)
 
 
-def _audit(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    first, record = _first_judged(request, inputs), _record(request, inputs, config)
+def _audit(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
+    first, record = _first_judged(request, inputs), _record(request, inputs)
     for stamps, positions, velocities in _blocks(inputs, first):
         record.measure_block(stamps, positions, velocities)
-    return _finish_logged(request, inputs, config, record, first)
+    return _finish_logged(request, inputs, record, first)
 
 
-def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    scene, model, states = inputs.scene, inputs.model, inputs.states
-    first, record = _first_judged(request, inputs), _record(request, inputs, config)
+def _ask(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
+    scene, model, states, control = inputs.scene, inputs.model, inputs.states, request.config.control
+    first, record = _first_judged(request, inputs), _record(request, inputs)
     frame = request.frame or model.frame_names[-1]
     twists = twist_track(request, model, inputs.states.stamp_ns, console)
     task = OpenLoopTask(frame=frame, twists=twists)
@@ -56,12 +56,12 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
         goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
-    with commander_of(request, inputs, config.control, console, frame=frame, home=task.home) as commander:
+    with commander_of(request, inputs, console, frame=frame, home=task.home) as commander:
         for stamps, positions, velocities in _blocks(inputs, first):
             part = record.measure_block(stamps, positions, velocities)
             commanded = open_loop(
                 model,
-                config.control,
+                control,
                 LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
                 task,
                 lambda stamp: scene.at(stamp).barrier,
@@ -71,8 +71,8 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
             )
             record.trace.append(commanded)
     return replace(
-        _finish_logged(request, inputs, config, record, first),
-        twist_figures=twist_figures(model, config.control, frame, twists, record.trace),
+        _finish_logged(request, inputs, record, first),
+        twist_figures=twist_figures(model, control, frame, twists, record.trace),
         outside=commander if isinstance(commander, OutsideController) else None,
     )
 
@@ -80,33 +80,33 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: 
 def _measure_change(
     scene: KnownScene, record: ReplayRecord, before_ns: int, stamp_ns: int, position: Float64
 ) -> Iterator[SceneChange]:
-    """The change between scenes of two stamps for the arm at position (1, J); none for one scene."""
+    """The change between scenes of two stamps for the arm at (1, J)."""
     if scene.at(before_ns) is not scene.at(stamp_ns):
         before, after = (record.clearance_in(ns, np.array([stamp_ns]), position)[0] for ns in (before_ns, stamp_ns))
         yield SceneChange(stamp_ns=stamp_ns, before=float(before), after=float(after))
 
 
-def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
-    scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
-    motion = inputs.motion()
+def _drive(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
+    scene, model, record = inputs.scene, inputs.model, _record(request, inputs)
+    motion, control = inputs.motion(), request.config.control
     task = _task(
         request,
         inputs,
         motion,
         twist_track(request, model, inputs.states.stamp_ns, console),
-        config.control.limit_tolerance,
+        control.limit_tolerance,
     )
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
-    limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
+    limit = "to the log's end" if task.last_ns is not None else f"at most {control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
-    with commander_of(request, inputs, config.control, console, frame=task.frame, home=task.home) as commander:
+    with commander_of(request, inputs, console, frame=task.frame, home=task.home) as commander:
         trace = closed_loop(
             model,
-            config.control,
+            control,
             task,
             lambda stamp: scene.at(stamp).barrier,
             scene_step_at=scene.step_at,
-            plan_detour=planned_ways_out(inputs, task, config),
+            plan_detour=planned_ways_out(inputs, task, request.config),
             record=ObjectFile[ControlStep](),
             commander=commander,
             distance_to=scene.at(task.stamp_ns).distances["exact"],
@@ -124,19 +124,19 @@ def _drive(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
     if (next_ns := scene.next_ns(last_ns := int(stamps[-1]))) is not None:
         changes += _measure_change(scene, record, last_ns, next_ns, positions[-1:])
     return replace(
-        _finish(request, inputs, config, record, trace.static_violations, radius_of=0),
+        _finish(request, inputs, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
         scene_changes=tuple(changes),
-        twist_figures=twist_figures(model, config.control, task.frame, task.twists, record.trace),
+        twist_figures=twist_figures(model, control, task.frame, task.twists, record.trace),
         outside=commander if isinstance(commander, OutsideController) else None,
     )
 
 
-def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> ReplayRecord:
+def _record(request: ReplayRequest, inputs: ReplayInputs) -> ReplayRecord:
     return ReplayRecord(
         inputs.model,
         inputs.scene,
-        config=config,
+        config=request.config,
         max_map_age=request.max_map_age,
         is_continuous=request.re_anchor is None,
         declared=inputs.declared,
@@ -153,17 +153,14 @@ def _blocks(inputs: ReplayInputs, start: int) -> Iterator[tuple[Stamps, Float64,
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 
 
-def _finish_logged(
-    request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int
-) -> Replay:
+def _finish_logged(request: ReplayRequest, inputs: ReplayInputs, record: ReplayRecord, first: int) -> Replay:
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
     return _finish(
         request,
         inputs,
-        config,
         record,
-        static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control)),
+        static_violations(model, last.barrier, states.position[-1], scene_margin(model, request.config.control)),
         radius_of=-1,
     )
 
@@ -171,7 +168,6 @@ def _finish_logged(
 def _finish(
     request: ReplayRequest,
     inputs: ReplayInputs,
-    config: Config,
     record: ReplayRecord,
     statics: tuple[StaticViolation, ...],
     *,
@@ -184,7 +180,7 @@ def _finish(
     record.hindsight.finish()
     return Replay(
         model=inputs.model,
-        config=config,
+        config=request.config,
         mode=request.mode,
         fields=record.fields,
         trace=record.trace,

@@ -2,22 +2,25 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, lacking, passed_reason, plural
+from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.criteria import (
     BROKEN,
+    COMMANDED,
     CONTACT,
     LIMITS,
     MARGIN,
     SLOW,
     UNKNOWN,
+    Bound,
     Judged,
-    commanded,
     controller,
     events_of,
     goal,
@@ -152,17 +155,17 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
     the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
-    least, time_s, pair = worst_state(judged.replay.trace, "self_clearance", "self_pair")
-    if least < 0:
-        yield failed(
-            sentence=f"{pair} overlap by {mm(-least)}",
-            value=least,
+    trace = judged.replay.trace
+    found = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
+    least = np.inf if found is None or found.value is None else found.value
+    if found is not None and least < 0:
+        yield replace(
+            found,
+            outcome=Outcome.FAILED,
+            sentence=f"{found.who} overlap by {mm(-least)}",
             threshold=0.0,
             unit="m",
-            time_s=time_s,
-            who=pair,
             remedy="pairs that may touch are named by --srdf",
-            count=judged.replay.num_states,
             label=CONTACT,
         )
     elif np.isfinite(least):
@@ -240,51 +243,40 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
         )
 
 
-def position_limits(judged: Judged) -> Iterator[Reason]:
-    """Joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise."""
-    least, time_s, joint = worst_state(judged.replay.trace, "limit_margin", "limit_joint")
-    if least < -judged.request.config.control.limit_tolerance:
-        yield failed(
-            sentence=f"{joint} is {-least:.4f} rad or m outside its limits",
-            value=least,
-            threshold=0.0,
-            unit="rad",
-            time_s=time_s,
-            who=joint,
-            remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
-            count=judged.replay.num_states,
-            label=LIMITS,
-        )
-    else:
-        yield passed_reason(f"at least {least:.3f} rad inside", least, 0.0, "rad", judged.replay.num_states)
+over_limit = partial(Bound, outcome=Outcome.FAILED, label=LIMITS)
+POSITION = over_limit(
+    on="limit_margin",
+    who="limit_joint",
+    at_least=0.0,
+    tolerance=attrgetter("request.config.control.limit_tolerance"),
+    unit="rad",
+    say="{who} is {negated:.4f} rad or m outside its limits",
+    kept="at least {value:.3f} rad inside",
+    remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
+)
+VELOCITY, ACCELERATION = (
+    over_limit(
+        on=f"{name}_share",
+        who=f"{name}_joint",
+        at_most=1.0,
+        tolerance=LIMIT_EXCEEDED - 1.0,
+        say="{who} reaches {value:.2f} times its limit",
+        kept="at most {value:.2f} of the limit",
+        remedy="check the stamps and units of the states, and the URDF's limits",
+    )
+    for name in ("velocity", "acceleration")
+)
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
     """Velocities and a user's commands exceed the URDF's limits by at most one percent."""
-    too_fast = commanded(judged)
-    yield from _share_of_limit(judged, "velocity") if too_fast is None else (too_fast,)
+    yield from [*COMMANDED(judged)] or VELOCITY(judged)
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
     """Accelerations exceed `control.max_acceleration`, where it is set, by at most one percent."""
-    yield from _share_of_limit(judged, "acceleration")
-
-
-def _share_of_limit(judged: Judged, name: str) -> Iterator[Reason]:
-    most, time_s, joint = worst_state(judged.replay.trace, f"{name}_share", f"{name}_joint", np.nanargmax)
-    if most > LIMIT_EXCEEDED:
-        yield failed(
-            sentence=f"{joint} reaches {most:.2f} times its limit",
-            value=most,
-            threshold=1.0,
-            time_s=time_s,
-            who=joint,
-            remedy="check the stamps and units of the states, and the URDF's limits",
-            count=judged.replay.num_states,
-            label=LIMITS,
-        )
-    elif name == "velocity" or most > 0:
-        yield passed_reason(f"at most {most:.2f} of the limit", most, 1.0, "", judged.replay.num_states)
+    if judged.replay.trace["acceleration_share"].any():
+        yield from ACCELERATION(judged)
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
@@ -370,7 +362,12 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(name="true clearance", find=true_clearance, broken=BROKEN),
     Criterion(name="self-clearance", find=self_clearance, broken=f"{BROKEN} (contact, margin broken)"),
     Criterion(name="static clearance", find=static_clearance, broken=BROKEN),
-    Criterion(name="position limits", find=position_limits, broken=BROKEN),
+    Criterion(
+        name="position limits",
+        find=POSITION,
+        asked="joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise",
+        broken=BROKEN,
+    ),
     Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),
     Criterion(name="acceleration limits", find=acceleration_limits, broken=BROKEN),
     Criterion(name="controller", find=controller, broken=BROKEN),

@@ -7,7 +7,7 @@ from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.control.separation_file import read_separation
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, brief, check_gate_names
+from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, check_gate_names
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
@@ -39,7 +39,7 @@ from splatctrl_cli.jobs.replay.inputs import (
 )
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.lockstep import check_lockstep, choose_scene
-from splatctrl_cli.jobs.replay.metrics import Metrics, metric_scales, metrics_of
+from splatctrl_cli.jobs.replay.metrics import metric_scales, metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
 from splatctrl_cli.jobs.replay.request import MODES, Replay, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay.separation import add_separation, check_separation, separation_lines
@@ -51,18 +51,12 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReplayResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ReplayResult(JudgedResult):
     """A replay's result; notes: on robot, pictures and log; is_damaged: log parts were lost."""
 
-    __repr__ = brief
-
-    out: Path
     inputs: ReplayInputs
     replay: Replay
-    metrics: Metrics
-    verdict: Verdict
-    notes: tuple[str, ...]
     is_damaged: bool
 
     def exit_code(self, *, report_only: bool = False) -> int:
@@ -84,7 +78,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         for doubt in doubts_of(request, robot, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
-            found = replayed(request, inputs, config, progress)
+            found = replayed(request, inputs, progress)
         inputs.scene.finish()
         logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
@@ -113,7 +107,7 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         replay=found,
         metrics=metrics,
         verdict=verdict,
-        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found.separation)),
+        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found, metrics)),
         is_damaged=bool(inputs.source.loss.damaged),
     )
 

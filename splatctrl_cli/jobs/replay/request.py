@@ -139,14 +139,6 @@ class SeparationInput:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Separation:
-    """Inputs of the protective separation distance, and its figures by name, None without a person."""
-
-    inputs: tuple[SeparationInput, ...]
-    figures: Mapping[str, float | None]
-
-
-@dataclass(frozen=True, kw_only=True)
 class SceneChange:
     """A newer scene: least clearance [m] of the unmoved arm's surface before and after."""
 
@@ -167,7 +159,8 @@ class Replay:
     trace: as in `ReplayRecord`; `step_columns` or those of `open_loop` with a controller; `divergence_*` of a closed
     loop from the log (joints [rad], position [m], rotation [rad]); `clearance_true` if known. num_before_scene:
     states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state. statics, closest: as
-    in `ReplayRecord`. unwatched, overtaken: from later depth. outside: a user's controller.
+    in `ReplayRecord`. unwatched, overtaken: from later depth. separation: inputs of the protective distance.
+    outside: a user's controller.
     """
 
     model: RobotModel
@@ -190,7 +183,7 @@ class Replay:
     events: tuple[Event, ...] = ()
     twist_figures: Mapping[str, float | None] = made_by(default_factory=dict)
     map_error: MapError | None = None
-    separation: Separation | None = None
+    separation: tuple[SeparationInput, ...] | None = None
     outside: OutsideController | None = None
 
     @property

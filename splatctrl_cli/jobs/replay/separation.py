@@ -14,10 +14,10 @@ from splatctrl_cli.control.near_space import NEVER_SEEN, Seen
 from splatctrl_cli.control.separation import PERSON_SPEED, Approach, ArmMotion, Stop
 from splatctrl_cli.control.separation_file import ANYTHING, LABELLED, PERSON, DeclaredSeparation
 from splatctrl_cli.errors import UsageError, refuse_if
-from splatctrl_cli.evaluate.metrics import least
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, Separation, SeparationInput
+from splatctrl_cli.jobs.replay.metrics import Metrics
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SeparationInput
 from splatctrl_cli.jobs.replay.state_pass import blocks_of
 from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.records import Bool, Float64, Floats
@@ -64,7 +64,7 @@ def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: R
         f"{inputs.source.name}: person.who = 'labelled': no map has a surface with depth and a person's label",
         remedy="record masks of people with depth (--human-topic of reconstruct), or declare who = 'newcomer'",
     )
-    return replace(replay, separation=Separation(inputs=given, figures=_figures(replay.trace)))
+    return replace(replay, separation=given)
 
 
 def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
@@ -244,7 +244,7 @@ class _SeparationPass:
 
 
 def _joint_speeds(inputs: ReplayInputs, replay: Replay) -> Float64:
-    """Joint velocities (T, J): those of a driven arm are its commands, and 0 where it had none."""
+    """Joint velocities (T, J), of a driven arm its commands or 0."""
     if replay.closed_loop is not None:
         return np.asarray(np.nan_to_num(replay.trace["v"]), np.float64)
     stamps = replay.trace.stamp_ns
@@ -324,37 +324,31 @@ def unseen_cells(seen: Seen) -> Float64:
     return np.asarray(seen.origin + seen.voxel * np.argwhere(is_unseen & ~binary_erosion(is_unseen)))
 
 
-def _figures(trace: Trace) -> dict[str, float | None]:
+def _figures(replay: Replay, metrics: Metrics) -> dict[str, float | None]:
     """Values of `FIGURES`, None without a person or static surface."""
-    below, scale = trace["below_s"], trace["speed_scale"]
-    return {
-        "separation_margin_min": least(trace["separation_margin"]),
-        "time_below_separation": float(below.sum()),
-        "standstill_below_s": float(below[scale <= 0].sum()),
-        "speed_scale_min": least(scale),
-        "time_to_contact_min": least(trace["time_to_contact"]),
-        "stop_clearance_min": least(trace["stop_clearance"]),
-    }
+    below, scale = replay.trace["below_s"], replay.trace["speed_scale"]
+    own = metrics | {"standstill_below_s": float(below[scale <= 0].sum())}
+    return {name: own[name] for name in FIGURES}
 
 
-def separation_document(separation: Separation) -> dict[str, Any]:
+def separation_document(replay: Replay, metrics: Metrics) -> dict[str, Any]:
     """The content of ``separation.json``."""
     return {
         "standard": "ISO/TS 15066:2016, 5.5.4.2.3: S_p = S_h + S_r + S_s + C + Z_d + Z_r",
         "claim": NO_CLAIM,
         "figures": [
-            {"name": name, "value": separation.figures[name], "unit": unit, "meaning": meaning}
-            for name, (unit, meaning) in FIGURES.items()
+            {"name": name, "value": value, "unit": FIGURES[name][0], "meaning": FIGURES[name][1]}
+            for name, value in _figures(replay, metrics).items()
         ],
-        "inputs": [asdict(each) for each in separation.inputs],
+        "inputs": [asdict(each) for each in replay.separation or ()],
     }
 
 
-def separation_lines(separation: Separation | None) -> list[str]:
+def separation_lines(replay: Replay, metrics: Metrics) -> list[str]:
     """Sentences for the terminal."""
-    if separation is None:
+    if replay.separation is None:
         return []
-    known = {name: value for name, value in separation.figures.items() if value is not None}
+    known = {name: value for name, value in _figures(replay, metrics).items() if value is not None}
     figures = [f"{FIGURES[name][1]} {value:.3g} {FIGURES[name][0]}".rstrip() for name, value in known.items()]
-    assumed = ", ".join(each.symbol for each in separation.inputs if each.source == ASSUMED) or "nothing"
+    assumed = ", ".join(each.symbol for each in replay.separation if each.source == ASSUMED) or "nothing"
     return [*(f"separation: {figure}" for figure in figures), f"separation: assumed: {assumed}", NO_CLAIM]

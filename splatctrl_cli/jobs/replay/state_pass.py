@@ -196,10 +196,7 @@ class ReplayRecord:
         return np.concatenate(found)
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
-        """Use gaps of link surfaces where known, and record pairs below their margin.
-
-        Spheres may overlap without contact, or miss a contact.
-        """
+        """Use gaps of link surfaces where known, and record pairs below their margin."""
         surfaces, gaps = self._surfaces, np.empty((len(part.position), 0))
         if surfaces is not None:
             gaps = surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)

@@ -7,7 +7,7 @@ from operator import attrgetter
 
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, gate_reasons, verdict_of
-from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, nearby
+from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, largest_about
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, find_displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION, unlearned_link
@@ -71,8 +71,8 @@ def _how(judged: Judged) -> str:
     """Return "waived", "proven" (all space within the margin seen free), or an empty text."""
     if any(waivers(judged.request)):
         return "waived"
-    assumed = nearby(judged.replay.trace, "assumed")
-    return "proven" if assumed is not None and assumed[0] <= 0 else ""
+    assumed = largest_about(judged.replay.trace, "assumed")
+    return "proven" if assumed is not None and assumed <= 0 else ""
 
 
 def _notes(judged: Judged) -> Iterator[str]:
@@ -82,12 +82,12 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
-    unseen, assumed = (nearby(judged.replay.trace, name) for name in ("unseen", "assumed"))
+    unseen, assumed = (largest_about(judged.replay.trace, name) for name in ("unseen", "assumed"))
     if unseen is None:
         yield "space about the arm not judged"
-    if assumed is not None and assumed[0] > 0:
-        yield f"at most {100 * assumed[0]:.0f} % of the space within the margin of the arm was assumed to be free"
-    if nearby(judged.replay.trace, "evidence_age") is None:
+    if assumed is not None and assumed > 0:
+        yield f"at most {100 * assumed:.0f} % of the space within the margin of the arm was assumed to be free"
+    if largest_about(judged.replay.trace, "evidence_age") is None:
         yield "age of the evidence about the arm not judged"
     yield from _declared_notes(judged)
     yield from waivers(judged.request)

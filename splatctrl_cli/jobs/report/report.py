@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatctrl_cli.errors import DAMAGE, InputError, SplatCtrlError
-from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Result, Verdict
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batch.graph import columns_of
 from splatctrl_cli.jobs.batch.ledger import Run
@@ -20,7 +20,6 @@ from splatctrl_cli.jobs.runs.run_folder import (
     BatchFolder,
     FolderRequest,
     RunFolder,
-    WrittenFile,
     is_batch,
     open_batch,
     open_run,
@@ -55,17 +54,8 @@ class WriteReportRequest(ViewRequest):
     all_scenes: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class WriteReportResult(WrittenFile):
-    """The page; notes: why runs lack a 3-D scene."""
-
-    num_runs: int
-    num_scenes: int
-    notes: tuple[str, ...]
-
-
-def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
-    """Write the page.
+def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Result:
+    """Write the page; metrics: bytes, num_runs, num_scenes; notes: why runs lack a 3-D scene.
 
     Raises InputError if `path` is no run or batch, incomplete, too new, or not comparable with `against`.
     """
@@ -74,21 +64,17 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
         if is_batch(request.path)
         else _page_of_run(request, open_run(request.path))
     )
-    file = _write(request, page)
-    return WriteReportResult(
-        file=file,
-        bytes=file.stat().st_size,
-        num_runs=len(page.runs),
-        num_scenes=len(page.scenes),
-        notes=tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space),
-    )
+    notes = tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space)
+    made = _write(request, page, num_runs=len(page.runs), num_scenes=len(page.scenes))
+    return replace(made, notes=notes, document={**made.document, "notes": notes})
 
 
-def _write(request: FolderRequest, page: Page) -> Path:
+def _write(request: FolderRequest, page: Page, **figures: int) -> Result:
     out = request.out or sibling_path(request.path, ".html")
     with output_path(out, force=request.force, is_folder=False) as partial:
         partial.write_text(render_page(page), encoding="utf-8")
-    return out
+    metrics = {"bytes": out.stat().st_size, **figures}
+    return Result(out=out, metrics=metrics, document={"file": out, **metrics})
 
 
 def _page_of_run(request: WriteReportRequest, run: RunFolder) -> Page:
@@ -322,17 +308,11 @@ def _log(batch: BatchFolder, ran: Run) -> Table:
     return Table(title="Log", text="\n".join(lines[-12:]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewResult(WrittenFile):
-    """The page with its number of splats, states, and cubes of unobserved space."""
+def view(request: ViewRequest) -> Result:
+    """Write a 3-D page; metrics: bytes, num_splats, num_states, num_unknown (cubes of unobserved space).
 
-    num_splats: int
-    num_states: int
-    num_unknown: int
-
-
-def view(request: ViewRequest) -> ViewResult:
-    """Write a 3-D page. Raises InputError if there is nothing to show."""
+    Raises InputError if there is nothing to show.
+    """
     space = space_of(request.path, request.roots)
     name = request.path.absolute().name
     page = Page(
@@ -343,10 +323,9 @@ def view(request: ViewRequest) -> ViewResult:
         scenes={"scene": pack(space)},
         opens=True,
     )
-    file = _write(request, page)
-    return ViewResult(
-        file=file,
-        bytes=file.stat().st_size,
+    return _write(
+        request,
+        page,
         num_splats=max(map(len, space.splats.values()), default=0),
         num_states=0 if space.motion is None else len(space.motion.seconds),
         num_unknown=0 if space.unknown is None else len(space.unknown[0]),

@@ -189,7 +189,7 @@ def spread(times: list[float], when: float) -> list[int]:
 
 
 def _add_seen(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
-    """Add the cameras where they began, and the space that they never saw."""
+    """Add cameras at their start, and space that they never saw."""
     space = replace(space, cameras=[_camera(row) for row in scene.made_from.get("first_frames", [])])
     if grid is None:
         return space

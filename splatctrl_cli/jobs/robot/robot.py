@@ -11,6 +11,7 @@ from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import (
+    JudgedResult,
     Outcome,
     Reason,
     Verdict,
@@ -81,14 +82,11 @@ class RobotRequest(RobotOptions):
     seed: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class CoverageResult:
-    """Coverage of a robot by spheres; document: for JSON; remarks: on the sphere file."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CoverageResult(JudgedResult):
+    """Coverage of a robot by spheres; notes: on the sphere file."""
 
     report: CoverageReport
-    verdict: Verdict
-    document: Mapping[str, Any]
-    remarks: tuple[str, ...] = ()
 
 
 def _figures(report: CoverageReport) -> dict[str, Any]:
@@ -129,7 +127,7 @@ def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageRes
         report=report,
         verdict=_verdict(report, urdf, solids, "robot spheres", request.require, allowed),
         document={"urdf": str(request.urdf), "spheres": str(request.out), "seed": request.seed, **_figures(report)},
-        remarks=("", f"written: {request.out}"),
+        notes=("", f"written: {request.out}"),
     )
 
 
@@ -159,7 +157,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
         report=report,
         verdict=_verdict(report, urdf, solids, "robot check", request.require, DEFAULT_MARGIN),
         document=document | _figures(report),
-        remarks=tuple(text for text, holds in texts.items() if holds),
+        notes=tuple(text for text, holds in texts.items() if holds),
     )
 
 

@@ -131,14 +131,6 @@ class FolderRequest:
     force: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class WrittenFile:
-    """A written file and its size."""
-
-    file: Path
-    bytes: int
-
-
 def sibling_path(path: Path, ending: str) -> Path:
     """Path of the same name in the same folder, with another ending."""
     place = path if path.name.strip(".") else Path(os.path.realpath(path))  # . and .. have no name of their own

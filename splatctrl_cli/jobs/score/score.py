@@ -1,6 +1,6 @@
 """A score of scenes against held-out views of one or several scans."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import nan
@@ -19,7 +19,7 @@ from splatctrl_cli.evaluate.score_report import (
     report_of_scans,
     score_verdict,
 )
-from splatctrl_cli.evaluate.verdict import Verdict, brief, check_gate_names
+from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names
 from splatctrl_cli.field.clusters import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run, write_table
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder, open_splats, run_value
@@ -68,31 +68,11 @@ class ScoreRequest:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoreResult:
-    """A score; report: the content of ``score.json``."""
+def score(request: ScoreRequest, progress: Progress = SILENT) -> JudgedResult:
+    """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError.
 
-    __repr__ = brief
-
-    report: Mapping[str, Any]
-    verdict: Verdict
-    out: Path | None = None
-
-    @property
-    def metrics(self) -> Mapping[str, float | None]:
-        return dict(self.report["metrics"])
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        return self.verdict.counts
-
-    @property
-    def notes(self) -> Sequence[str]:
-        return tuple(self.report["warnings"])
-
-
-def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
-    """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError."""
+    Document: the content of ``score.json``.
+    """
     if request.baseline is not None:
         read_baseline(request.baseline)  # refuses it before the views are scored
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
@@ -104,7 +84,7 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
         return _score_scene(request, folder, progress)
 
 
-def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
+def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> JudgedResult:
     stopwatch, surface = Stopwatch(), dict[str, float]()
     if folder:
         folder.mkdir(exist_ok=True)
@@ -231,23 +211,27 @@ def _free_mass(path: Path, scene: SceneFolder) -> float:
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
 
-def _conclude(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> ScoreResult:
+def _conclude(request: ScoreRequest, report: dict[str, Any], *, is_damaged: bool) -> JudgedResult:
     if request.baseline is not None:
         report["metrics"] |= changes(report, request.baseline)
-    return ScoreResult(
-        report=report, verdict=score_verdict(report, request.require, is_damaged=is_damaged), out=request.out
+    return JudgedResult(
+        out=request.out,
+        metrics=dict(report["metrics"]),
+        document=report,
+        notes=tuple(report["warnings"]),
+        verdict=score_verdict(report, request.require, is_damaged=is_damaged),
     )
 
 
 def _write_result(
     folder: Path,
-    result: ScoreResult,
+    result: JudgedResult,
     *,
     config: Mapping[str, Any],
     inputs: Mapping[str, str] | None = None,
     stopwatch: Stopwatch | None = None,
 ) -> None:
-    write_json(folder / "score.json", result.report)
+    write_json(folder / "score.json", result.document)
     write_run(
         folder,
         command="score",
@@ -275,8 +259,8 @@ def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
 
 def _score_scans(
     request: ScoreRequest, scenes: Mapping[str, Path], folder: Path | None, progress: Progress
-) -> ScoreResult:
-    results: dict[str, ScoreResult] = {}
+) -> JudgedResult:
+    results: dict[str, JudgedResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
         # gates and baseline apply to the means alone
@@ -287,7 +271,7 @@ def _score_scans(
     report = {
         "scenes": str(request.scene),
         "reference": str(request.recording.path),
-        **report_of_scans({scan: result.report for scan, result in results.items()}),
+        **report_of_scans({scan: result.document for scan, result in results.items()}),
     }
     result = _conclude(request, report, is_damaged=any(one.verdict.is_damaged for one in results.values()))
     if folder is not None:

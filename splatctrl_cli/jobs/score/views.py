@@ -3,7 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import isnan
 from operator import itemgetter
 from pathlib import Path
@@ -66,12 +66,7 @@ class Scorer:
         scene, has_clock = self.scene, self.has_clock
         off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
-
-        @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
-        def splats_at(stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
-            splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
-            return splats, scene.shell_at(stamp_ns)
-
+        splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))  # read once for its views
         views = views_to_score(
             self.reference.source,
             scoring=self.cameras,
@@ -200,6 +195,12 @@ def render_splats(
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
+
+
+def splats_and_shell(scene: SceneFolder, stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
+    """Splats and shell as known at a stamp [ns], or at the end."""
+    splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+    return splats, scene.shell_at(stamp_ns)
 
 
 def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:

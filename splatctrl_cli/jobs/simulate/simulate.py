@@ -12,6 +12,7 @@ from defusedxml import ElementTree
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.errors import InputError, UsageError, refuse_if
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
@@ -75,26 +76,11 @@ class SimulateRequest:
         return {**vars(self.options), **{name: value for name, value in own.items() if value}}
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulateResult:
-    """The folder, the log's truth, frames by camera, and bytes by file or folder."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SimulateResult(Result):
+    """The folder and the log's truth; document: also bytes by file or folder."""
 
-    out: Path
     truth: Truth
-    num_frames: Mapping[str, int]
-    sizes: Mapping[str, int]
-
-    @property
-    def metrics(self) -> dict[str, Any]:
-        truth = self.truth
-        training = [camera.name for camera in truth.cameras if camera.is_training]
-        return {
-            "frames": self.num_frames,
-            "joint_states": len(truth.stamps),
-            "luminance_std": {name: round(value, 4) for name, value in truth.luminance_std.items()},
-            "min_luminance_std": round(min(truth.luminance_std[name] for name in training), 4),
-            "min_clearance": round(float(truth.clearance.min()), 4),
-        }
 
 
 def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateResult:
@@ -103,7 +89,14 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         with stopwatch.stage("log"):
             truth, num_frames = _record(folder, request, progress)
-        result = SimulateResult(out=request.out, truth=truth, num_frames=num_frames, sizes={})
+        contrast = truth.luminance_std
+        metrics = {
+            "frames": num_frames,
+            "joint_states": len(truth.stamps),
+            "luminance_std": {name: round(value, 4) for name, value in contrast.items()},
+            "min_luminance_std": round(min(contrast[c.name] for c in truth.cameras if c.is_training), 4),
+            "min_clearance": round(float(truth.clearance.min()), 4),
+        }
         write_json(folder / "truth.json", truth_document(truth))
         if request.dtu:
             with stopwatch.stage("dtu"):
@@ -125,11 +118,12 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
             command="simulate",
             config=request.config,
             inputs={} if request.urdf is None else {request.urdf.name: sha256(request.urdf)},
-            metrics=result.metrics,
+            metrics=metrics,
             stopwatch=stopwatch,
             seed=request.options.seed,
         )
-        return replace(result, sizes=_sizes(folder))
+        document = {"out": request.out, "bytes": _sizes(folder), **metrics}
+    return SimulateResult(out=request.out, metrics=metrics, document=document, truth=truth)
 
 
 def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple[Truth, dict[str, int]]:
@@ -288,8 +282,9 @@ def _copy(source: Path, folder: Path, copies: Mapping[tuple[str, str], str], is_
 
 
 def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
-    """Find postures (K, J) with the tip at a pose (4, 4), moved nearer to the base if out of reach. q: the simulated
-    arm's, a first guess.
+    """Find postures (K, J) with the tip at a pose (4, 4), or nearer to the base.
+
+    q: a first guess.
     """
     tip = model.frame_names[-1]
     guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
@@ -323,9 +318,7 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close or slowed; infinite in collision. A slowed leg must avoid all, since
-    objects move.
-    """
+    """Cost of a leg: length [rad], more if close or slowed; infinite in collision."""
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]
     if is_late and any(primitive.track is not None for primitive in scene.primitives):

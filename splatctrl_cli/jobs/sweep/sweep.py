@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome
+from splatctrl_cli.evaluate.verdict import EXIT_CODES, Outcome, Result
 from splatctrl_cli.files.output import MARKERS, check_can_be_written, write_durably, write_json
 from splatctrl_cli.jobs.batch.batch import scheduling, write_batch
 from splatctrl_cli.jobs.batch.graph import CommandLine, Node, nodes_of
@@ -81,8 +81,8 @@ class KeyFlip(Flip[Tried]):
         return f"{name}: {before} {way} to {last:.6g}{unit}, {after} at {first:.6g}{beyond}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class SweepResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SweepResult(Result):
     """Content of ``sweep.json``; before: the run's own verdict."""
 
     out: Path

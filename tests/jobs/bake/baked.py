@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config import Config, FieldConfig
-from splatctrl_cli.jobs.bake.bake import BakeResult, bake
+from splatctrl_cli.evaluate.verdict import JudgedResult
+from splatctrl_cli.jobs.bake.bake import bake
 from splatctrl_cli.jobs.bake.request import BakeRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.records import Box
@@ -33,7 +34,7 @@ def baked(
     box: tuple[float, ...] | None = None,
     progress: Progress = SILENT,
     **options: Any,
-) -> BakeResult:
+) -> JudgedResult:
     """`field`: more settings of it; `options`: what else of the request."""
     config = replace(Config(), field=FieldConfig(voxel=voxel, max_loss=1.0, **(field or {})))
     covered = None if box is None else Box.from_text(",".join(map(str, box)))

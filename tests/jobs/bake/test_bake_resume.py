@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import UsageError, WriteError
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import GridLayout
@@ -22,7 +23,6 @@ from splatctrl_cli.formats.grid.grid_format import GridSlabs
 from splatctrl_cli.formats.grid.grid_formats import FORMATS
 from splatctrl_cli.formats.splat.splats import write_ply
 from splatctrl_cli.jobs.bake import bake as bake_slabs
-from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked
@@ -46,7 +46,7 @@ def whole(splats: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
     return contents(out)
 
 
-def bake(splats: Path, out: Path, **more: Any) -> BakeResult:
+def bake(splats: Path, out: Path, **more: Any) -> JudgedResult:
     options: dict[str, Any] = {"voxel": 0.03, "channels": CHANNELS, "formats": ("npz", "vti")}
     return baked(splats, out, **(options | more))
 

@@ -12,12 +12,12 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.field import slabs
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.formats.splat.splats import read_ply, write_ply
 from splatctrl_cli.jobs.bake.accuracy import counts_of
-from splatctrl_cli.jobs.bake.bake import BakeResult
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.replay_desk import write_scene
@@ -67,7 +67,7 @@ def fields(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def bake(scene: Path, out: Path, *, voxel: float = 0.025, **more: Any) -> BakeResult:
+def bake(scene: Path, out: Path, *, voxel: float = 0.025, **more: Any) -> JudgedResult:
     return baked(scene, out, voxel=voxel, **more)
 
 
@@ -190,7 +190,7 @@ def true_splats(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return path
 
 
-def bake_true(scene: Path, out: Path, **more: Any) -> BakeResult:
+def bake_true(scene: Path, out: Path, **more: Any) -> JudgedResult:
     return baked(scene, out, voxel=0.03, box=tuple(TRUE_BOX.ravel()), **more)
 
 
@@ -200,14 +200,14 @@ def test_held_out_depth_agrees_with_splats_on_the_true_surface(
     folder = sample_data / "tabletop"
     robot = {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
     held_out = {"held_out": folder / "log.mcap", "held_out_cameras": ("cam3",)}
-    found = bake_true(true_splats, tmp_path / "field", **held_out, **robot).accuracy["held_out_depth"]
+    found = bake_true(true_splats, tmp_path / "field", **held_out, **robot).document["accuracy"]["held_out_depth"]
     assert found["num_frames"] == 1
     half_a_cell = 0.015  # which the interpolation of a surface between two cells may read on it
     near = found["before"]["seen"]["sdf"][0]
     assert 0 < found["on_surface"]["hard"]["median"] < half_a_cell
     assert abs(near["median"]) < half_a_cell
     assert near["count"] > 20
-    with_robot = bake_true(true_splats, tmp_path / "robot", **held_out).accuracy["held_out_depth"]
+    with_robot = bake_true(true_splats, tmp_path / "robot", **held_out).document["accuracy"]["held_out_depth"]
     assert with_robot["num_measured"] > found["num_measured"], (
         "pixels of the robot count where nobody says where it is"
     )
@@ -224,7 +224,7 @@ def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, 
     folder = sample_data / "tabletop"
     truth = {"truth": folder / "truth.json", "seen_by": folder / "log.mcap"}
     result = bake_true(true_splats, tmp_path / "field", **truth, with_probability=True, no_report=False)
-    found = result.accuracy["truth"]
+    found = result.document["accuracy"]["truth"]
     assert 0 < found["error_sigma"] < 0.02
     calibrated, paper = found["reliability"]["calibrated"], found["reliability"]["paper"]
     assert calibrated["count"].sum() == paper["count"].sum() > 50
@@ -256,7 +256,7 @@ def test_a_figure_of_a_band_rests_on_the_cells_of_that_band() -> None:
 SMALL_BOX = (-0.2, -0.2, -0.2, 0.2, 0.2, 0.2)
 
 
-def bake_splats(splats: SplatSet, folder: Path, **more: Any) -> BakeResult:
+def bake_splats(splats: SplatSet, folder: Path, **more: Any) -> JudgedResult:
     write_ply(folder / "splats.ply", splats, {})
     return baked(folder / "splats.ply", folder / "field", voxel=0.05, **more)
 

@@ -11,10 +11,11 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError, WriteError
-from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.evaluate.verdict import Result
+from splatctrl_cli.formats.splat.gaussian_ply import Differences, write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, read_ply, write_ply
 from splatctrl_cli.jobs.export import export as job
-from splatctrl_cli.jobs.export.export import ExportRequest, ExportResult
+from splatctrl_cli.jobs.export.export import ExportRequest
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
 from tests.jobs.export.test_export_run import ball, written
@@ -26,16 +27,16 @@ def scene(tmp_path: Path) -> Path:
     return written(tmp_path / "scene", ball())
 
 
-def export(scene: Path, name: str, **options: Any) -> ExportResult:
+def export(scene: Path, name: str, **options: Any) -> Result:
     return job.export(ExportRequest(scene=scene, out=scene.parent / name, **options))
 
 
 def test_scene_is_exported_and_renders_the_same(scene: Path) -> None:
     result = export(scene, "out.ply")
-    assert export(scene, "again.ply").file.read_bytes() == result.file.read_bytes()
-    assert result.largest_pixel_difference <= 3 / 255
-    assert result.covered_share > 0.1
-    assert result.num_splats == 400
+    assert export(scene, "again.ply").out.read_bytes() == result.out.read_bytes()
+    assert result.metrics["largest_pixel_difference"] <= 3 / 255
+    assert result.metrics["covered_share"] > 0.1
+    assert result.metrics["num_splats"] == 400
     splats, comments = read_ply(scene.parent / "out.ply")
     assert len(splats) == 400
     assert comments["scene"] == "ball"
@@ -125,10 +126,10 @@ def gaussians(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("suffix", [".spz", ".glb"])
 def test_isotropic_splats_go_to_another_format_and_from_there_back_to_ply(scene: Path, suffix: str) -> None:
     there = export(scene, f"there{suffix}")
-    assert there.num_outside == 0
-    assert not there.differences.beyond(there.allowed)
-    assert there.psnr is None or there.psnr > (35 if suffix in ROUNDED else 100)
-    assert there.not_kept == (("labels",) if suffix in ROUNDED else ())
+    assert there.metrics["num_outside"] == 0
+    assert not Differences(**there.metrics["differences"]).beyond(Differences(**there.metrics["allowed"]))
+    assert there.metrics["psnr"] is None or there.metrics["psnr"] > (35 if suffix in ROUNDED else 100)
+    assert there.metrics["not_kept"] == (("labels",) if suffix in ROUNDED else ())
     export(scene.parent / f"there{suffix}", "back.ply")
     back = read_ply(scene.parent / "back.ply")[0]
     np.testing.assert_allclose(back.centers, ball().centers, atol=1.3e-4 if suffix == ".spz" else 0)
@@ -138,19 +139,19 @@ def test_isotropic_splats_go_to_another_format_and_from_there_back_to_ply(scene:
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_anisotropic_gaussians_go_to_every_format(gaussians: Path, suffix: str) -> None:
     result = export(gaussians, f"out{suffix}")
-    assert result.covered_share > 0.1
-    assert result.not_kept == (("view-dependent colour",) if suffix == ".splat" else ())
+    assert result.metrics["covered_share"] > 0.1
+    assert result.metrics["not_kept"] == (("view-dependent colour",) if suffix == ".splat" else ())
     if suffix in ROUNDED:
-        assert 25 < result.psnr < 60
+        assert 25 < result.metrics["psnr"] < 60
     else:
-        assert result.psnr is None or result.psnr > 100
-        assert result.largest_pixel_difference <= 3 / 255
+        assert result.metrics["psnr"] is None or result.metrics["psnr"] > 100
+        assert result.metrics["largest_pixel_difference"] <= 3 / 255
 
 
 def test_the_full_layout_has_the_62_properties_and_says_what_it_leaves_out(scene: Path) -> None:
     out = scene.parent / "out.ply"
     write_ply(scene / "splats.ply", replace(ball(), density=np.ones(400, np.float32)), {})
-    assert export(scene, "out.ply", layout="full").not_kept == ("labels", "density")
+    assert export(scene, "out.ply", layout="full").metrics["not_kept"] == ("labels", "density")
     header = out.read_bytes().split(b"end_header")[0].decode()
     assert header.count("property float") == header.count("property ") == 62
     assert "comment exported_from: splats.ply sha256 " in header
@@ -163,7 +164,8 @@ def test_anisotropic_gaussians_are_made_isotropic_on_request_alone(gaussians: Pa
     export(gaussians, "out.ply")
     expect_refusal(r"got 400 of 400 whose scales differ; .*--isotropic", read_ply, out)
     result = export(gaussians, "out.ply", isotropic=True, force=True)
-    assert result.was_rounded and result.isotropic_psnr is not None and 15 < result.isotropic_psnr < 60
+    assert any(note.startswith("made isotropic: PSNR") for note in result.notes)
+    assert result.metrics["isotropic_psnr"] is not None and 15 < result.metrics["isotropic_psnr"] < 60
     np.testing.assert_allclose(read_ply(out)[0].radii, 0.02 * 0.45 ** (1 / 3), rtol=1e-5)
 
 

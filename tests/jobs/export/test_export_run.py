@@ -65,7 +65,7 @@ def logged(path: Path) -> Messages:
     out = path.with_name("out.mcap")
     made = export_run(ExportRunRequest(path=path, out=out))
     found = read_back(out)
-    assert {topic: len(messages) for topic, messages in found.items()} == made.messages
+    assert {topic: len(messages) for topic, messages in found.items()} == made.metrics["messages"]
     return found
 
 
@@ -135,7 +135,7 @@ def test_a_scene_and_a_field_are_logged_without_an_arm(run: Runs, tmp_path: Path
         main(["sdf-bake", "scene", "-o", "field", "--box=-1.2,-0.2,1.1,-0.8,0.2,1.5", "-q", "--formats", "npz"]) == 0
     )
     found = export_run(ExportRunRequest(path=tmp_path / "field"))
-    (_, message), = read_back(found.file)["/distance"]  # fmt: skip
+    (_, message), = read_back(found.out)["/distance"]  # fmt: skip
     with np.load(tmp_path / "field" / "field.npz") as grid:
         np.testing.assert_array_equal(unpacked(message, NUMBERS)["distance"], np.ravel(grid["sdf"], order="F"))
 

@@ -11,13 +11,14 @@ import pytest
 
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField
 from splatctrl_cli.formats import ply
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.splat.splats import write_ply
-from splatctrl_cli.jobs.query.query import TITLES, QueryRequest, QueryResult, query
+from splatctrl_cli.jobs.query.query import TITLES, QueryRequest, query
 from splatctrl_cli.records import Float64, Label
 from tests.cli.replay_desk import splats_of, write_scene
 from tests.jobs.bake.baked import baked
@@ -36,7 +37,7 @@ def scene(tmp_path: Path) -> Path:
     return write_scene(tmp_path / "scene", (START_NS, people))
 
 
-def asked(source: Path, points: Float64 = POINTS, **options: object) -> tuple[QueryResult, list[dict[str, str]]]:
+def asked(source: Path, points: Float64 = POINTS, **options: object) -> tuple[Result, list[dict[str, str]]]:
     out = source.parent / "answers.csv"
     text = "x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in points)
     given = {"source": source, "points": io.StringIO(text), "out": out, "force": True, **options}
@@ -66,7 +67,7 @@ def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene:
     assert {row["observed"] for row in rows[:4]} == {"free"} and rows[4]["observed"] == "never_seen"
     assert (result.metrics["num_points"], result.metrics["num_never_seen"]) == (5, 1)
     assert result.metrics["min_distance"] == pytest.approx(distance.min(), abs=1e-6)
-    assert (result.metrics["num_in_collision"], result.kind) == (1, "scene")
+    assert (result.metrics["num_in_collision"], result.document["source"]) == (1, "scene")
 
 
 def test_the_bound_of_a_scene_is_never_above_the_exact_distance_and_hardly_below(scene: Path) -> None:
@@ -118,7 +119,7 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
         assert [row[name] for row in both] == [row[name] for row in of_grid]
     for name in ("label", "splat", "observed", "surface_x", "surface_rest"):
         assert [row[name] for row in both] == [row[name] for row in of_scene]
-    assert (both[4]["probability"], result.kind) == ("", "field and scene")
+    assert (both[4]["probability"], result.document["source"]) == ("", "field and scene")
     other = write_scene(tmp_path / "other", (START_NS, splats_of(BALLS[0])))
     with pytest.raises(UsageError, match=r"field: was not baked from the splats of .*other; .* as --scene"):
         asked(field, scene=other)

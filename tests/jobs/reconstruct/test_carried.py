@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import Config, SceneConfig, load_config
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
-from splatctrl_cli.jobs.reconstruct.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.source import open_source
@@ -80,7 +81,7 @@ def declared(folder: Path, *boxes: str) -> Path:
     return path
 
 
-def mapped(stage: Stage, declare: Path | None, progress: Progress = SILENT) -> ReconstructResult:
+def mapped(stage: Stage, declare: Path | None, progress: Progress = SILENT) -> JudgedResult:
     urdf, spheres = Path(stage.desk.robot[1]), Path(stage.desk.robot[3])
     settings = ["scene.max_splats=3000", "scene.first_iterations=10", "scene.iterations_per_step=3"]
     request = ReconstructRequest(

@@ -123,7 +123,7 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
     write_scene(tmp_path, monkeypatch)
     set_up(monkeypatch, Half(), FakeSource(frames=FRAMES))
     for has_shell in (False, True):
-        views[has_shell] = scores(tmp_path).report["views"][1]
+        views[has_shell] = scores(tmp_path).document["views"][1]
     assert views[True]["psnr_all"] > views[False]["psnr_all"] + 20
     kept = ("depth_median_all", "depth_coverage_all", "depth_pixels_all", "in_front_all", "seen_share")
     assert [views[True][name] for name in kept] == [views[False][name] for name in kept]

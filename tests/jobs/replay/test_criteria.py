@@ -24,7 +24,7 @@ from splatctrl_cli.jobs.replay.criteria import Judged, controller
 from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.motion_criteria import clearance, surface_clearance, unlearned_link
+from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION, clearance, surface_clearance, unlearned_link
 from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
 from splatctrl_cli.jobs.replay.trace import Trace
@@ -197,6 +197,19 @@ def test_one_state_judged_by_an_old_map_is_enough() -> None:
 
 def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
     assert outcomes(evidence.evidence_age, judged({"evidence_age": np.full(NUM, 1.5)})) == [Outcome.NOT_EVALUABLE]
+
+
+def test_a_log_that_ends_with_the_motion_is_not_blamed_for_an_old_map() -> None:
+    (reason,) = evidence.map_age(judged({"map_age_s": np.append(np.full(NUM - 1, 0.1), 1.01)}))
+    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s, from 1.00 to 1.00 s")
+
+
+@pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.PASSED), (1.5, Outcome.FAILED)])
+def test_a_joint_may_pass_its_limit_by_the_tolerance(share: float, outcome: Outcome) -> None:
+    margin = np.full(NUM, -share * ControlConfig().limit_tolerance)
+    (criterion,) = [one for one in OF_MOTION if one.name == "position limits"]
+    (reason,) = criterion.reasons(judged({"limit_margin": margin, "limit_joint": ["elbow"] * NUM}))
+    assert (reason.outcome, reason.who) == (outcome, "elbow" if outcome is Outcome.FAILED else "")
 
 
 def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:

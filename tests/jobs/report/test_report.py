@@ -75,7 +75,7 @@ def test_a_scene_opens_at_its_first_camera_and_has_a_menu_of_all(stage: Stage, t
     side = space_of(scene).cameras[1]
     assert (side["name"], side["eye"], side["fov"]) == ("side", eyes["side"], pytest.approx(90.0))
     np.testing.assert_allclose(side["ahead"], np.array([0.0, -1.0, -0.2]) / np.hypot(1.0, 0.2))
-    page = view(ViewRequest(path=scene, out=tmp_path / "page.html")).file
+    page = view(ViewRequest(path=scene, out=tmp_path / "page.html")).out
     script = f"""{OPENED} const place = () => {{ viewer.paint(); return viewer.camera.position.toArray(); }};
       const menu = document.querySelector("select"); found.names = [...menu.options].map((one) => one.textContent);
       found.front = place(); menu.value = 1; menu.onchange(); found.side = place(); found.fov = viewer.camera.fov;
@@ -169,7 +169,7 @@ def test_what_is_no_whole_run_is_refused(run: Runs, break_it: Callable[[Path], N
 
 def test_a_report_is_not_replaced_without_force_and_a_run_without_anything_to_see_is_refused(run: Runs) -> None:
     folder = run()
-    assert write_report(WriteReportRequest(path=folder)).file == folder.with_name("audit.html")
+    assert write_report(WriteReportRequest(path=folder)).out == folder.with_name("audit.html")
     expect_refusal("already exists", write_report, WriteReportRequest(path=folder), error=UsageError)
     patch_json(folder / "run.json", lambda found: found | {"command": "score"})
     expect_refusal("score leaves nothing to see", view, ViewRequest(path=folder))
@@ -343,14 +343,14 @@ def test_a_page_without_webgl_says_so(run: Runs) -> None:
 def test_scene_splats_and_field_have_pages(run: Runs, tmp_path: Path) -> None:
     run()
     scene = view(ViewRequest(path=tmp_path / "scene", out=tmp_path / "scene.html"))
-    assert (scene.num_splats, scene.num_states) == (2, 0)
+    assert (scene.metrics["num_splats"], scene.metrics["num_states"]) == (2, 0)
     splats = view(ViewRequest(path=tmp_path / "scene" / "splats.ply", out=tmp_path / "ply.html"))
-    assert replace(splats, file=scene.file, bytes=0) == replace(scene, bytes=0, num_unknown=0)
+    assert splats.metrics | {"bytes": 0} == scene.metrics | {"bytes": 0, "num_unknown": 0}
     assert (
         main(["sdf-bake", "scene", "-o", "field", "--box=-1.2,-0.2,1.1,-0.8,0.2,1.5", "-q", "--formats", "npz"]) == 0
     )
     assert space_of(tmp_path / "field").surface is not None
-    found = found_on(scene.file, f"{OPENED} found.parts = Object.keys(viewer.parts);")
+    found = found_on(scene.out, f"{OPENED} found.parts = Object.keys(viewer.parts);")
     assert found == {"parts": ["objects", "grid of 10 cm"], "complaints": []}
 
 

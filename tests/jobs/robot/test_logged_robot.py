@@ -235,7 +235,7 @@ def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
 def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     path = log_with(tmp_path / "run.mcap", described(robot()))
     assert describe(path).facts["robot_description"] == ["/robot_description"]
-    capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture"))[0]
+    capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture")).out
     assert is_capture(capture)
     assert (capture / "robot_description.urdf").read_text() == robot()
     assert logged_urdf([capture]).text == robot()

@@ -12,6 +12,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.formats.splat.splats import FORMATS, as_gaussians, write_ply
@@ -21,7 +22,7 @@ from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest
 from splatctrl_cli.jobs.recordings.provenance import first_frame
 from splatctrl_cli.jobs.score import reference as score_reference
 from splatctrl_cli.jobs.score import score as score_job
-from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
@@ -54,22 +55,22 @@ def scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write_scene(tmp_path, monkeypatch)
 
 
-def run(folder: Path, cameras: tuple[str, ...] | None = None, **changes: Any) -> ScoreResult:
+def run(folder: Path, cameras: tuple[str, ...] | None = None, **changes: Any) -> JudgedResult:
     recording = RecordingRequest(path=Path("fake.mcap"), options=SourceOptions(cameras=cameras))
     return score(ScoreRequest(scene=folder / "scene", recording=recording, **changes))
 
 
 def test_views_are_rendered_from_the_newest_snapshot_early_ones_counted_and_seen_pixels_told(scored: Path) -> None:
     result = run(scored)
-    assert result.report["cameras"] == ["cam3"]
-    assert result.report["skipped_views"] == ["cam3-0000"]
-    dark, right, away = result.report["views"]
+    assert result.document["cameras"] == ["cam3"]
+    assert result.document["skipped_views"] == ["cam3-0000"]
+    dark, right, away = result.document["views"]
     assert (dark["view"], right["view"], away["view"]) == ("cam3-0001", "cam3-0002", "cam3-0003")
     assert dark["psnr_all"] == pytest.approx(20.0, abs=0.6), "0.4 instead of 0.5"
     assert right["psnr_all"] == pytest.approx(40.0, abs=2.5), "off by 0.01, and rounded to 8 bits"
     assert right["depth_median_all"] < 1e-6
     assert (result.metrics["num_views"], result.metrics["num_skipped"]) == (3, 1)
-    assert (result.counts["psnr_all"], result.counts["psnr_seen"], result.notes) == (2, 2, ())
+    assert (result.verdict.counts["psnr_all"], result.verdict.counts["psnr_seen"], result.notes) == (2, 2, ())
     assert right["seen_share"] == pytest.approx(58 / 64, abs=0.03), "the view is moved by 0.1 m, 6 pixels"
     assert away["seen_share"] == 0.0
     assert away["psnr_seen"] is None
@@ -77,7 +78,7 @@ def test_views_are_rendered_from_the_newest_snapshot_early_ones_counted_and_seen
 
 
 def test_final_splats_serve_all_views_when_asked(scored: Path) -> None:
-    first, *_ = run(scored, newest=False).report["views"]
+    first, *_ = run(scored, newest=False).document["views"]
     assert first["psnr_all"] > 50
 
 
@@ -85,7 +86,7 @@ def test_without_a_clock_every_view_is_scored_from_the_final_splats(
     scored: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     set_up(monkeypatch, FakeScene(has_clock=False, snapshots=()), FakeSource(frames=FRAMES, has_clock=False))
-    report = run(scored).report
+    report = run(scored).document
     assert report["snapshots"] == "final"
     assert report["metrics"]["num_skipped"] == 0
     assert len(report["views"]) == 4
@@ -113,7 +114,7 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     assert names == ["cam3_best_worst.png", "run.json", "score.json", "views.csv"]
     rows = list(csv.DictReader((result.out / "views.csv").read_text().splitlines()))
     report = json.loads((result.out / "score.json").read_text())
-    assert report == result.report
+    assert report == result.document
     assert [row["view"] for row in rows] == [view["view"] for view in report["views"]]
     assert float(rows[0]["psnr_all"]) == report["views"][0]["psnr_all"]
     assert rows[2]["psnr_seen"] == ""
@@ -125,14 +126,14 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
 
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path) -> None:
     result = run(scored, require=("psnr_all>=1",))
-    assert result.report["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"
+    assert result.document["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"
     assert result.verdict.exit_code == 5
     assert "psnr_all is unknown" in result.verdict.sentence
 
 
 def test_a_training_camera_is_scored_only_when_allowed(scored: Path) -> None:
     expect_refusal("--cameras cam0: cam0 trained the scene", run, scored, cameras=("cam0",), error=UsageError)
-    (view,) = run(scored, cameras=("cam0",), allow_training=True).report["views"]
+    (view,) = run(scored, cameras=("cam0",), allow_training=True).document["views"]
     assert view["seen_share"] == view["valid_share"]
 
 
@@ -164,7 +165,7 @@ def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: p
     write_dtu(scored / "dtu", "scan1", views)
     set_up(monkeypatch, FakeScene(cameras=("camera",), has_clock=False, snapshots=()), FakeSource(frames=[]))
     held_out = RecordingRequest(path=scored / "dtu", is_dtu=True, options=SourceOptions(holdout=("1",)))
-    report = score(ScoreRequest(scene=scored / "scene", recording=held_out)).report
+    report = score(ScoreRequest(scene=scored / "scene", recording=held_out)).document
     (view,) = report["views"]
     assert (view["view"], view["camera"], report["training_cameras"]) == ("holdout-0001", "holdout", ["camera"])
     assert view["psnr_seen"] == pytest.approx(20.0, abs=0.6)
@@ -190,14 +191,14 @@ def test_a_render_before_the_recorded_surface_is_in_front(scored: Path, monkeypa
     late.depth[late.depth > 0] += 0.05
     seen = frame(3 * SECOND, "cam0", FRONT)
     set_up(monkeypatch, FakeScene(), FakeSource(frames=[seen, frame(2 * SECOND, "cam3", SIDE), late]))
-    assert [view["in_front_all"] for view in run(scored).report["views"]] == [0.0, 1.0]
+    assert [view["in_front_all"] for view in run(scored).document["views"]] == [0.0, 1.0]
 
 
 def test_what_no_splat_covers_shows_the_background_of_the_scene(
     scored: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     set_up(monkeypatch, FakeScene(background=(0.0, 1.0, 0.0)), FakeSource(frames=FRAMES))
-    away = run(scored).report["views"][2]
+    away = run(scored).document["views"][2]
     assert away["psnr_all"] == pytest.approx(10 * np.log10(3), abs=0.01), "green before a black view of nothing"
 
 
@@ -224,14 +225,14 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_session(folder: Path, *names: str) -> ScoreResult:
+def run_session(folder: Path, *names: str) -> JudgedResult:
     first, *beside = (folder / name for name in names)
     recording = RecordingRequest(path=first, beside=tuple(beside))
     return score(ScoreRequest(scene=folder / "scene", recording=recording, images="none"))
 
 
 def test_a_camera_of_another_log_is_scored_beside_the_log_that_trained(session: Path) -> None:
-    report = run_session(session, "a.mcap", "b.mcap").report
+    report = run_session(session, "a.mcap", "b.mcap").document
     assert (report["cameras"], report["metrics"]["num_views"]) == (["cam1"], 5)
     assert report["metrics"]["seen_share"] > 0.99, "both cameras stand at one place"
     assert report["reference"] == f"{session / 'a.mcap'} + {session / 'b.mcap'}"
@@ -297,7 +298,7 @@ def wall_with_harmonics() -> GaussianSet:
     )
 
 
-def run_file(file: Path, **changes: object) -> ScoreResult:
+def run_file(file: Path, **changes: object) -> JudgedResult:
     recording = RecordingRequest(path=file.parent / "fake.mcap")
     return score(ScoreRequest(scene=file, recording=recording, **changes))  # type: ignore[arg-type]
 

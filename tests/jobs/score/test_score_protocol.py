@@ -15,10 +15,11 @@ from splatctrl_cli.cli.score import lines_of
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import space_out
 from splatctrl_cli.evaluate.protocols import score_protocol
+from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, is_folder_of_views
 from splatctrl_cli.jobs.score.reference import missing_views
-from splatctrl_cli.jobs.score.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings
 from splatctrl_cli.recording.folder.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.recording.folder.idr import DtuSource, write_idr
@@ -55,15 +56,15 @@ def place(tmp_path_factory: pytest.TempPathFactory, views: list[DtuView]) -> Pat
 
 def scored(
     place: Path, root: str | Path, protocol: str = HOLDOUT, *, masks: Path | None = None, **changes: Any
-) -> ScoreResult:
+) -> JudgedResult:
     """The scene of `place` against a scan in its folder `root`."""
     recording = RecordingRequest(path=place / root, is_dtu=True, protocol=protocol, masks=masks)
     return score(ScoreRequest(**{"scene": place / "scene", "recording": recording, **changes}))
 
 
 def test_a_scan_scores_the_same_through_both_layouts(place: Path) -> None:
-    one = scored(place, "mvsnet", masks=place / "masks").report
-    other = scored(place, "idr").report
+    one = scored(place, "mvsnet", masks=place / "masks").document
+    other = scored(place, "idr").document
     assert (one["protocol"]["layout"], other["protocol"]["layout"]) == ("MVSNet's", "IDR's")
     assert one["protocol"]["mask_rule"] == other["protocol"]["mask_rule"] == "object mask"
     assert {view["view"] for view in one["views"]} == {"holdout-0000", "holdout-0004"}
@@ -95,7 +96,7 @@ def test_a_scan_without_depth_is_not_reconstructed_without_points(
 
 
 def test_the_report_says_by_what_its_figures_came_about(place: Path) -> None:
-    result = scored(place, "idr").report
+    result = scored(place, "idr").document
     out = "\n".join(lines_of(result))
     assert "\nprotocol: holdout:every4 (a rule given by hand)\n" in out
     assert "\nsplit: train 1-3, 5-7; score 0, 4\n" in out
@@ -161,7 +162,7 @@ def test_warnings_are_noted_counted_and_can_be_gated(place: Path, tmp_path: Path
 
 
 def test_figures_are_compared_with_those_of_an_earlier_score(place: Path, tmp_path: Path) -> None:
-    earlier = dict(scored(place, "mvsnet").report)
+    earlier = dict(scored(place, "mvsnet").document)
     earlier["metrics"]["psnr_all"] += 1.5
     path = tmp_path / "score.json"
     path.write_text(json.dumps(earlier))
@@ -171,7 +172,7 @@ def test_figures_are_compared_with_those_of_an_earlier_score(place: Path, tmp_pa
         "score: GATE FAILED (2 views): --require change_psnr_all>=-1: change_psnr_all"
     )
     assert result.verdict.sentence.endswith(" is -1.5, required >= -1")
-    (change,) = [line.split() for line in lines_of(result.report) if line.startswith("change")]
+    (change,) = [line.split() for line in lines_of(result.document) if line.startswith("change")]
     assert change[1:6] == ["-", "+0.00", "-1.50", "+0.0000", "+0.0000"]
     with pytest.raises(UsageError, match="change_psnr_all>=-1: a figure of --baseline; give it"):
         scored(place, "mvsnet", require=gates)
@@ -207,7 +208,7 @@ def surface(views: list[DtuView]) -> Float64:
     return np.concatenate(parts)
 
 
-def figures(result: ScoreResult) -> dict[str, float]:
+def figures(result: JudgedResult) -> dict[str, float]:
     """The metrics that have a value."""
     return {name: value for name, value in result.metrics.items() if value is not None}
 
@@ -233,7 +234,7 @@ def test_the_surface_is_compared_with_a_cloud_in_millimetres(
     assert 0.0005 < metrics["completeness"] < 0.012
     assert metrics["chamfer"] == pytest.approx((metrics["accuracy"] + metrics["completeness"]) / 2)
     assert metrics["completeness_seen_beyond"] < metrics["completeness_beyond"] + 1e-9
-    out = "\n".join(lines_of(result.report))
+    out = "\n".join(lines_of(result.document))
     assert "surface: accuracy " in out
     assert "1 unit = 0.001 m; points 4 mm apart; means below 20 mm" in out
     blind = figures(scored(place, "blind", cloud=settings))
@@ -258,7 +259,7 @@ def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
     assert 100 < metrics["num_points"] < 0.5 * whole["num_points"]
     above = space_out(points, 0.004)[:, 2] > 0.03
     assert metrics["num_reference"] == pytest.approx(np.count_nonzero(above), rel=0.05)
-    assert "within the masks and above the planes of" in result.report["protocol"]["definitions"]["cloud"]
+    assert "within the masks and above the planes of" in result.document["protocol"]["definitions"]["cloud"]
     with pytest.raises(InputError):
         scored(place, "mvsnet", cloud=CloudSettings(path=tmp_path / "masks.ply"))
     with pytest.raises(InputError, match=r"ObsMask1_10\.mat: no such file; give the folder ObsMask"):
@@ -301,7 +302,7 @@ def test_a_scene_without_first_frames_is_told_by_the_digests_of_its_files(
     del old["metrics"]["first_frames"]
     path.write_text(json.dumps(old))
     result = scored(place, "mvsnet", scene=tmp_path / "scene")
-    assert result.report["recording"]["basis"] == ["digests of 32 files of the same names"]
+    assert result.document["recording"]["basis"] == ["digests of 32 files of the same names"]
     write_dtu(tmp_path / "other", "scan1", [replace(view, color=view.color // 2) for view in views])
     changed = "8 of 32 files have other contents, such as Rectified/scan1_train/rect_001_3_r5000.png"
     expect_refusal(changed, scored, place, tmp_path / "other", scene=tmp_path / "scene")
