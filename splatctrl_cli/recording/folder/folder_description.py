@@ -1,5 +1,6 @@
 """The TOML description of an image folder (docs/input.md)."""
 
+import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.errors import InputError, did_you_mean, refuse_faults, refuse_if, require
-from splatctrl_cli.formats.unpacking import read_toml
 from splatctrl_cli.recording.folder.poses import AXES, CONVENTIONS, FORMATS, rigid
 from splatctrl_cli.recording.log.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
@@ -183,7 +183,7 @@ _HELP = "see splatctrl help input"
 
 def read_description(path: Path, root: Path | None = None) -> Description:
     """Parse a description. Raises InputError naming an unknown, missing or wrong key."""
-    return _read(read_toml(path, _HELP), path, root)
+    return _read(_content(path), path, root)
 
 
 def read_table(
@@ -198,7 +198,7 @@ def read_table(
 
     Raises as `read_description`.
     """
-    content = read_toml(path, _HELP)
+    content = _content(path)
     _check_keys(content, {name, *beside}, str(path), "")
     if fill is not None and isinstance(content.get(name), dict):
         content[name] = fill(content[name])
@@ -207,7 +207,7 @@ def read_table(
 
 def has_table(path: Path, name: str) -> bool:
     """True if the file has a table [name]. Raises InputError if not TOML."""
-    return name in read_toml(path, _HELP)
+    return name in _content(path)
 
 
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
@@ -216,7 +216,7 @@ def read_rig(path: Path, root: Path | None = None) -> list[Description]:
     Keys are [camera]'s, and `color`, `depth`, `poses` for files; the rest is common. Raises as `read_description`,
     and for shared or missing names.
     """
-    content = read_toml(path, _HELP)
+    content = _content(path)
     cameras = content.pop("cameras", [])
     refuse_if(
         not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras),
@@ -246,6 +246,11 @@ def _describe_camera(common: dict[str, Any], camera: dict[str, Any], path: Path)
         "frames": {"color": camera["color"], "depth": camera["depth"]},
         "poses": {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]},
     }
+
+
+def _content(path: Path) -> dict[str, Any]:
+    with refuse_faults(f"{path}: not valid TOML", tomllib.TOMLDecodeError, UnicodeDecodeError, remedy=_HELP):
+        return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:

@@ -52,7 +52,7 @@ class Recorded:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     recorded = Recorded(tmp_path_factory.mktemp("recorded"))
     robot = ("--urdf", "recording/robot.urdf", "--spheres", "recording/robot_spheres.yaml")
-    fit = ("--cameras", "cam0,cam1,cam2", "--max-splats", "2000", "--set", "scene.fill=0.8")
+    fit = ("--cameras", "cam0,cam1,cam2", "--max-splats", "4000", "--set", "scene.fill=0.8")
     quick = ("--set", "scene.first_iterations=40", "--set", "scene.iterations_per_step=5")
     recorded.command("simulate", *SIMULATE)
     recorded.command("reconstruct", "recording/log.mcap", *robot, *fit, *quick, "-o", "scene")
