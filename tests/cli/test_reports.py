@@ -41,7 +41,7 @@ def suite_in(path: Path) -> TestSuite:
 
 
 def test_every_command_that_concludes_takes_junit() -> None:
-    """By the functions that show what a job judged, themselves or through one of the same file."""
+    """A function concludes if it shows a verdict, directly or through another function of its file."""
     concluding = set()
     for path in CLI.glob("*.py"):
         functions = {

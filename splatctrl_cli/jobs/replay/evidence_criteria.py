@@ -37,13 +37,13 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
-        quantity="path from a surface of the map to the arm, by a point never seen",
+        quantity="from a surface of the map to the arm, through a point never seen",
         why="an object may extend into space on its unseen side",
         on="unseen_path",
         unit="m",
         above=UNSEEN_PATH,
-        say="a surface of the map is {mm} from the arm by a path over unseen space, allowed {allowed_mm}: it may "
-        "extend there",
+        say="a surface of the map is {mm} from the arm through unseen space, expected over {allowed_mm}: the object "
+        "may extend to the arm",
         remedy="add a camera that sees that side",
     ),
     Bound(

@@ -37,7 +37,7 @@ def scene(tmp_path: Path) -> Path:
     return write_scene(tmp_path / "scene", (START_NS, people))
 
 
-def asked(source: Path, points: Float64 = POINTS, **options: object) -> tuple[Result, list[dict[str, str]]]:
+def query_points(source: Path, points: Float64 = POINTS, **options: object) -> tuple[Result, list[dict[str, str]]]:
     out = source.parent / "answers.csv"
     text = "x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in points)
     given = {"source": source, "points": io.StringIO(text), "out": out, "force": True, **options}
@@ -53,7 +53,7 @@ def column(rows: list[dict[str, str]], *names: str) -> Float64:
 
 
 def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene: Path) -> None:
-    result, rows = asked(scene)
+    result, rows = query_points(scene)
     centers, radii = np.array([ball[0] for ball in BALLS]), np.array([ball[1] for ball in BALLS])
     field, exact = field_over(Spheres.of(centers, radii), FieldConfig()), SphereField(Spheres.of(centers, radii))
     distance, gradient = field.query(POINTS)
@@ -72,31 +72,31 @@ def test_a_scene_answers_with_its_field_its_nearest_splat_and_the_surface(scene:
 
 def test_the_bound_of_a_scene_is_never_above_the_exact_distance_and_hardly_below(scene: Path) -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
-    _, rows = asked(scene, points)
+    _, rows = query_points(scene, points)
     exact = np.min([np.linalg.norm(points - np.array(c), axis=1) - r for c, r in BALLS], axis=0)
     bound = column(rows, "bound")[:, 0]
     assert (bound <= exact).all() and (bound >= exact - 1e-5).all()
 
 
 def test_the_probability_is_that_of_the_distance_and_a_label_that_is_left_out_is_not_near(scene: Path) -> None:
-    _, rows = asked(scene, config=HARD)
+    _, rows = query_points(scene, config=HARD)
     assert float(rows[2]["probability"]) == pytest.approx(1.0)
     assert float(rows[0]["probability"]) == pytest.approx(0.0, abs=1e-9)
-    _, rows = asked(scene, labels=frozenset({Label.OBJECT}))
+    _, rows = query_points(scene, labels=frozenset({Label.OBJECT}))
     assert {row["label"] for row in rows} == {"object"}
     assert float(rows[1]["distance"]) > 0.4
 
 
 def test_an_occupied_voxel_without_a_splat_is_an_obstacle_without_an_index(tmp_path: Path) -> None:
     lone = write_scene(tmp_path / "lone", (START_NS, splats_of(BALLS[0])), unrepresented=[(0.5, 0.0, 0.0)])
-    _, rows = asked(lone, config=HARD)
+    _, rows = query_points(lone, config=HARD)
     assert (rows[1]["splat"], rows[1]["label"]) == ("", "object")
     assert float(rows[1]["distance"]) == pytest.approx(0.2 - 0.05 * math.sqrt(3), abs=2e-3)
 
 
 def test_a_grid_answers_within_its_box_and_leaves_the_rest_empty(scene: Path) -> None:
     field = baked(scene, scene.parent / "field", voxel=0.05, box=BOX).out
-    result, rows = asked(field)
+    result, rows = query_points(field)
     grid = GridField(read_npz(field / "field.npz"))
     assert column(rows, "distance")[:4, 0] == pytest.approx(grid.query(POINTS[:4])[0], abs=1e-6)
     assert column(rows, "bound")[:4, 0] == pytest.approx(grid.certified(POINTS[:4]), abs=1e-6)
@@ -112,9 +112,9 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
 ) -> None:
     """Another scene does not go with it."""
     field = baked(scene, scene.parent / "field", voxel=0.05, box=BOX).out
-    _, of_grid = asked(field)
-    _, of_scene = asked(scene)
-    result, both = asked(field / "field.npz", scene=scene)
+    _, of_grid = query_points(field)
+    _, of_scene = query_points(scene)
+    result, both = query_points(field / "field.npz", scene=scene)
     for name in ("in_box", "distance", "gradient_x", "bound"):
         assert [row[name] for row in both] == [row[name] for row in of_grid]
     for name in ("label", "splat", "observed", "surface_x", "surface_rest"):
@@ -122,21 +122,21 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
     assert (both[4]["probability"], result.document["source"]) == ("", "field and scene")
     other = write_scene(tmp_path / "other", (START_NS, splats_of(BALLS[0])))
     with pytest.raises(UsageError, match=r"field: was not baked from the splats of .*other; .* as --scene"):
-        asked(field, scene=other)
+        query_points(field, scene=other)
 
 
 def test_blocks_change_no_answer(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    whole = asked(scene, points)
+    whole = query_points(scene, points)
     monkeypatch.setattr(ply, "POINTS_PER_BLOCK", 7)
-    parts = asked(scene, points)
+    parts = query_points(scene, points)
     assert parts[1] == whole[1]
     assert parts[0].metrics == pytest.approx(whole[0].metrics)
 
 
 def test_a_bare_splat_file_knows_nothing_of_space(tmp_path: Path) -> None:
     write_ply(tmp_path / "splats.ply", splats_of(*BALLS), {})
-    result, rows = asked(tmp_path / "splats.ply")
+    result, rows = query_points(tmp_path / "splats.ply")
     assert {row["observed"] + row["in_box"] for row in rows} == {""}
     assert result.metrics["num_never_seen"] is None and result.notes == ()
 
@@ -154,6 +154,6 @@ def test_a_wrong_line_after_many_right_ones_leaves_no_file(scene: Path, monkeypa
 def test_cells_without_a_distance_are_told(scene: Path) -> None:
     outside = (-2.5, -0.4, -0.4, 0.9, 0.4, 0.4)
     field = baked(scene, scene.parent / "field", voxel=0.1, box=outside, field={"unknown": "nan"}).out
-    result, rows = asked(field, np.array([[-2.2, 0.0, 0.0], [0.0, 0.0, 0.25]]))
+    result, rows = query_points(field, np.array([[-2.2, 0.0, 0.0], [0.0, 0.0, 0.25]]))
     assert rows[0]["distance"] == "" and rows[1]["distance"] != ""
     assert any("1 points lie next to unseen cells" in note for note in result.notes)

@@ -248,7 +248,7 @@ ALONE: dict[str, Broken] = {
         "not evaluable",
         "100 % of the space within the margin of the arm",
     ),
-    "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "by a path over unseen space"),
+    "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "from the arm through unseen space"),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 7.7 mm from the arm"),
     "lost edge": (beside_a_lost_edge, (), "known space", "not evaluable", "lost 11.0 mm from the arm"),
     "lost edge at last": (

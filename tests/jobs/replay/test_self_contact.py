@@ -239,7 +239,7 @@ def measured(model: RobotModel, urdf: Path, packages: Path) -> MeasuredRobot:
 
 
 def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONFIG) -> ReplayTrace:
-    """From where the log is 3 s before its end to where it ends."""
+    """The arm is driven over the last 3 s of the log."""
     motion, frame = tabletop.arm_motion(7.0), model.frame_names[-1]
     goal = model.frame_pose(motion.at(7.0)[0], frame)
     task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=goal, frame=frame)
