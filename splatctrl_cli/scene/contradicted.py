@@ -86,9 +86,9 @@ def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterat
     """Yield what other frames or the drawn robot contradict in each frame of a step.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end over `CONTRADICTED`
-    [m] behind it, or have no return, in range and outside stereo shadows, or no return from the drawn robot. Fewer than
-    `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks that others' rays cross
-    prove no space free. each: a `map` over frames.
+    [m] behind it, or have no return, in range and outside stereo shadows. Blocks of the drawn robot without return
+    count, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks
+    that others' rays cross prove no space free. each: a `map` over frames.
     """
     views = list(each(_BlockView.of, *zip(*seen, strict=True)))
     through = [np.zeros_like(view.surely) for view in views]
