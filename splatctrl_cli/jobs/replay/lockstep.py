@@ -142,8 +142,8 @@ def reconstruct_scene(
 class Lockstep:
     """Frame sets still to come, and stamps and files of the maps so far.
 
-    ends_with_log: known space is of the whole log, else of the frame sets passed. is_real_time: a map is known when
-    this machine has computed it; of the frame sets that come meanwhile the newest waits, the others are dropped.
+    ends_with_log: known space is of the whole log, else of the frame sets passed. is_real_time: a map but the
+    first is known when this machine has computed it; of the frame sets that come meanwhile only the newest waits.
     held_out_every: one in so many is evidence and left out.
     """
 
@@ -240,7 +240,7 @@ class Lockstep:
         self._taking.append((step.stamp_ns, seconds))
         known_ns = self._start_ns(step)
         if self._is_real_time:
-            known_ns += round(1e9 * seconds)
+            known_ns += round(1e9 * seconds) if self._known_ns else 0
             self._skip(known_ns)
         for snapshot in taken[len(self._files) :]:
             self._stamps_ns.append(snapshot.stamp_ns)
