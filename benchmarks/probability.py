@@ -15,8 +15,7 @@ from benchmarks.measure import Options, Result, rms
 from benchmarks.surfaces import Shape, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import field_over
-from splatctrl_cli.field.probability import CalibratedProbability, PaperProbability
+from splatctrl_cli.field.distance import CalibratedProbability, PaperProbability, field_over
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.field_pictures import Reliability, reliability, reliability_picture
 

@@ -225,13 +225,14 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
     while missing := [camera for camera in rig.recorded if camera not in placed]:
         votes = {camera: _votes(camera, by_camera, placed, T_world_board, rig, stands) for camera in missing}
         best = max(missing, key=lambda camera: len(votes[camera]))
-        if len(votes[best]) < fixed.CALIBRATION_BOARD_FEWEST:
-            groups = f"{', '.join(sorted(placed))} | {', '.join(missing)}"
-            raise NotEvaluableError(
-                f"calibrate: cameras that the board does not tie together: {groups}: they never see it at the same"
-                f" moment (expected {fixed.CALIBRATION_BOARD_FEWEST} times)",
-                remedy=SHOW,
-            )
+        groups = f"{', '.join(sorted(placed))} | {', '.join(missing)}"
+        refuse_if(
+            len(votes[best]) < fixed.CALIBRATION_BOARD_FEWEST,
+            f"calibrate: cameras that the board does not tie together: {groups}: they never see it at the same"
+            f" moment (expected {fixed.CALIBRATION_BOARD_FEWEST} times)",
+            remedy=SHOW,
+            error=NotEvaluableError,
+        )
         placed[best] = invert_transform(rig.recorded[best][by_camera[best][0].stamp_ns]) @ middle_pose(votes[best])
     return placed
 

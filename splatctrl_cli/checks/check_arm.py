@@ -116,18 +116,6 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
     return float(near[low]) + shift, float(least)
 
 
-def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
-    """Two joints whose exchange puts the arm where depth shows it, or None."""
-    few = spread(frames, limits.SWAPPED_FRAMES)
-    plain = arm_agreement(model, few, posture)
-    tried = (
-        (arm_agreement(model, few, _exchanged(posture, *p)), p) for p in combinations(range(model.num_joints), 2)
-    )
-    good = ((agreement.misfit, pair) for agreement, pair in tried if agreement is not None and agreement.is_good)
-    best = min(good, default=None)
-    return None if best is None or plain is None or best[0] > limits.SWAPPED_MISFIT * plain.misfit else best[1]
-
-
 def _exchanged(posture: Posture, i: int, j: int) -> Posture:
     def exchanged(stamp_ns: int) -> Float64 | None:
         q = posture(stamp_ns)
@@ -240,7 +228,15 @@ def _own_offsets(
 
 
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
-    pair = swapped_joints(model, thin_frames(frames), posture)
+    """Remedy that names two joints whose exchange puts the arm where depth shows it; empty without such a pair."""
+    few = spread(thin_frames(frames), limits.SWAPPED_FRAMES)
+    plain = arm_agreement(model, few, posture)
+    tried = (
+        (arm_agreement(model, few, _exchanged(posture, *p)), p) for p in combinations(range(model.num_joints), 2)
+    )
+    good = ((agreement.misfit, pair) for agreement, pair in tried if agreement is not None and agreement.is_good)
+    best = min(good, default=None)
+    pair = None if best is None or plain is None or best[0] > limits.SWAPPED_MISFIT * plain.misfit else best[1]
     if pair is None:
         return ""
     a, b = (model.joint_names[i] for i in pair)

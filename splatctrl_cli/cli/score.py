@@ -7,7 +7,7 @@ from typing import Any
 from splatctrl_cli.cli.common import Console, remarks, request_of, table
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError, refuse_if
-from splatctrl_cli.evaluate.score_report import PREFIX
+from splatctrl_cli.evaluate.score import PREFIX
 from splatctrl_cli.evaluate.verdict import plural
 from splatctrl_cli.jobs.score.score import ScoreRequest, score
 from splatctrl_cli.jobs.score.views import CloudSettings

@@ -1,25 +1,36 @@
-"""Scores of rendered against recorded views, over all pixels and those seen in training."""
+"""Scores of rendered against recorded views, over all pixels and those seen in training, and conclusions from them.
 
+A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
+"""
+
+import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import IN_FRONT
-from splatctrl_cli.errors import NotEvaluableError, refuse_if
+from splatctrl_cli.config.fixed import IN_FRONT, OTHER_VIEW_CLEARLY, SAME_PLACE_DEGREES, SAME_PLACE_METRES
+from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_if
+from splatctrl_cli.evaluate.held_out_depth import CLOUD_SCALES
 from splatctrl_cli.evaluate.metrics import (
     BAD_SHARE,
     DECIBELS,
     DESCRIBES,
+    FAULTS,
     GOOD_SHARE,
     SIMILARITY,
     Better,
     Scale,
 )
-from splatctrl_cli.evaluate.views import depth_errors, psnr, published_ssim, ssim_map
-from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, SplatSet
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, plural, verdict_of
+from splatctrl_cli.evaluate.views import View, depth_errors, psnr, published_ssim, ssim_map
+from splatctrl_cli.geometry import compare_poses
+from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.voxels import OccupancyGrid
 
 PROTOCOL = {
@@ -154,3 +165,232 @@ def total_score(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 def as_json(figures: dict[str, float]) -> dict[str, Any]:
     """The figures, None if not finite."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+
+
+PREFIX = "change_"
+SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
+AVERAGING = "mean over the views"
+SCALES = {
+    **metric_scales(),
+    **CLOUD_SCALES,
+    "free_mass": BAD_SHARE,
+    "num_skipped": DESCRIBES,
+    "num_warnings": FAULTS,
+    "num_scans": DESCRIBES,
+}
+NAMES = tuple(SCALES)
+NAMES_WITH_CHANGES = (*NAMES, *(PREFIX + name for name in NAMES))  # since a baseline
+
+
+def read_baseline(path: Path) -> dict[str, Any]:
+    """An earlier score's report. Raises InputError for another file."""
+    try:
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(earlier["metrics"], dict) and isinstance(earlier["protocol"], dict):
+            return dict(earlier)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise InputError(f"{path}: expected the score.json of an earlier score, got another file")
+
+
+def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
+    """New minus old figures, None if either is. Raises InputError if not comparable."""
+    earlier = read_baseline(path)
+    now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
+    for name in ("name", "split", "mask_rule", "resolution", "averaging", "scans"):
+        refuse_if(
+            now.get(name) != then.get(name),
+            f"{path}: not comparable: {name}: expected {now.get(name)}, got {then.get(name)}",
+            remedy="score the baseline anew, in the same way",
+        )
+    old: Mapping[str, Any] = earlier["metrics"]
+    return {
+        PREFIX + name: value - old[name] if value is not None and isinstance(old.get(name), int | float) else None
+        for name, value in report["metrics"].items()
+    }
+
+
+def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the scans; None for a figure missing in one."""
+    each, scans = list(results.values()), list(results)
+    metrics = {
+        name: (sum_of if name in SUMS else mean_of)([one["metrics"].get(name) for one in each])
+        for name in each[0]["metrics"]
+    }
+    protocols = [result["protocol"] for result in each]
+    warnings = [f"{scan}: {line}" for scan, result in results.items() for line in result["warnings"]]
+    return {
+        "scans": scans,
+        "protocol": _common(protocols) | {"averaging": f"{AVERAGING} of a scan, then over the scans"},
+        "metrics": metrics | {"num_scans": len(results)},
+        "warnings": [*warnings, *other_scans(protocols[0], scans)],
+        "results": dict(results),
+    }
+
+
+def sum_of(values: Sequence[float | None]) -> float | None:
+    """The sum; None if any value is missing."""
+    known = [value for value in values if value is not None]
+    return sum(known) if len(known) == len(values) else None
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    total = sum_of(values)
+    return None if total is None else total / len(values)
+
+
+def _common(protocols: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The scans' common protocol; differing values are joined."""
+    first = protocols[0]
+    common = {}
+    for name, value in first.items():
+        others = list(dict.fromkeys(str(protocol[name]) for protocol in protocols))
+        common[name] = value if len(others) == 1 else " | ".join(others)
+    sizes = [size for protocol in protocols for size in protocol["resolution"]]
+    return common | {"resolution": sorted(set(sizes)), "background": first["background"]}
+
+
+def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
+    """Warning of scans that differ from the published mean's."""
+    published = protocol["published_scans"]
+    missing = [number for number in published or () if f"scan{number}" not in scans]
+    others = [name for name in scans if name not in {f"scan{number}" for number in published or ()}]
+    if not published or not (missing or others):
+        return []
+    parts = [
+        *([f"lacks scans {', '.join(map(str, missing))}"] if missing else []),
+        *([f"has {', '.join(others)} more"] if others else []),
+    ]
+    return [f"{protocol['name']}: this mean {' and '.join(parts)}; the published one is of {len(published)} scans"]
+
+
+def score_verdict(report: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> Verdict:
+    metrics, counts = report["metrics"], counts_of(report)
+    num_views, num_scans = metrics["num_views"], metrics.get("num_scans")
+    compared = Reason(
+        criterion="views",
+        outcome=Outcome.PASSED if num_views else Outcome.NOT_EVALUABLE,
+        sentence=f"{plural(num_views, 'view')} compared",
+        value=float(num_views),
+        threshold=1.0,
+        count=int(num_views),
+    )
+    notes = [note(criterion="score", sentence=line) for line in report["warnings"]]
+    return verdict_of(
+        "score",
+        [compared, *notes, *gate_reasons(require, dict.fromkeys(NAMES_WITH_CHANGES, None) | metrics, counts)],
+        scope=plural(num_views, "view") + ("" if num_scans is None else f" of {plural(num_scans, 'scan')}"),
+        is_damaged=is_damaged,
+        counts=counts,
+    )
+
+
+def counts_of(report: Mapping[str, Any]) -> dict[str, int]:
+    metrics = report["metrics"]
+    each = [report] if "views" in report else list(report["results"].values())
+    views = [view for one in each for view in one["views"]]
+    num_views = int(metrics["num_views"])
+    counts = {}
+    for name in metrics:
+        figure = name.removeprefix(PREFIX)
+        counts[name] = sum(view[figure] is not None for view in views) if figure in views[0] else num_views
+    return counts
+
+
+THUMBNAIL = (16, 12)  # pixels
+
+
+@dataclass(kw_only=True)
+class Doubts:
+    """Collected oddities of views: inverted masks, training views, wrong poses.
+
+    is_still: a static scene; may_train: training views are scored on purpose.
+    """
+
+    is_still: bool
+    may_train: bool = False
+    mask_rule: str = "none"
+    _thumbnails: list[tuple[str, Float64, Float64]] = field(default_factory=list)
+    _masks: list[str] = field(default_factory=list)
+    _twins: list[str] = field(default_factory=list)
+
+    def look(self, view: View, render: NDArray[np.floating], mask: Bool | None) -> None:
+        """Check a view, its render (H, W, 3) in [0, 1] and mask (H, W).
+
+        Raises InputError for an empty mask.
+        """
+        if mask is not None and not mask.any():
+            raise InputError(
+                f"{view.name}: mask rule '{self.mask_rule}': expected pixels to score, got none of {mask.size}",
+                remedy="the masks have to be this scan's, 255 on the object",
+            )
+        if mask is not None and self.mask_rule == "object mask":
+            self._masks += [f"{view.name} {doubt}"] if (doubt := _mask_doubt(mask)) else []
+        if not self.is_still:
+            return
+        self._twins += [] if self.may_train else _twin(view)
+        photo, drawn = _thumbnail(view.frame.color / 255.0), _thumbnail(np.clip(render, 0.0, 1.0))
+        self._thumbnails.append((view.name, photo, drawn))
+
+    def lines(self) -> list[str]:
+        lines = []
+        if self._masks:
+            lines.append(
+                f"{self._masks[0]}{_and_more(self._masks)}: is the mask turned inside out? it has to be 255 on the"
+                " object and 0 around it"
+            )
+        if self._twins:
+            lines.append(
+                f"{self._twins[0]}{_and_more(self._twins)}: a view that trained says nothing about others; is a view"
+                " there twice?"
+            )
+        if strangers := _strangers(self._thumbnails):
+            lines.append(
+                f"{strangers[0]}{_and_more(strangers)}: do the cameras belong to these images, and in this order?"
+            )
+        return lines
+
+
+def _and_more(lines: Sequence[str]) -> str:
+    return "" if len(lines) == 1 else f" (and {len(lines) - 1} more)"
+
+
+def _mask_doubt(mask: Bool) -> str:
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    at_border, share = float(border.mean()), float(mask.mean())
+    if at_border > 0.5 and at_border >= share:
+        return f"has its mask on {100 * at_border:.0f}% of the image's border and {100 * share:.0f}% of the image"
+    return ""
+
+
+def _twin(view: View) -> list[str]:
+    for other in view.training:
+        metres, degrees = compare_poses(view.frame.T_world_camera, other.T_world_camera)
+        if metres <= SAME_PLACE_METRES and degrees <= SAME_PLACE_DEGREES:
+            return [f"{view.name} stands {1e3 * metres:.1f} mm and {degrees:.2f} degrees from a training view"]
+    return []
+
+
+def _thumbnail(image: NDArray[np.floating]) -> Float64:
+    small = cv2.resize(np.asarray(image, np.float32), THUMBNAIL, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float64).ravel()
+
+
+def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
+    """Views whose photo is clearly nearer another's render."""
+    if len(thumbnails) < 2:
+        return []
+    names, photos, renders = zip(*thumbnails, strict=True)
+    x, y = np.stack(photos), np.stack(renders)
+    squared = np.square(x).sum(axis=1)[:, None] + np.square(y).sum(axis=1) - 2 * x @ y.T
+    decibels = -10 * np.log10(np.maximum(squared / x.shape[1], 1e-8))
+    own, best = np.diag(decibels), decibels.argmax(axis=1)
+    size = "{}x{}".format(*THUMBNAIL)
+    return [
+        f"{name}'s photo is nearer the render of {names[j]} ({decibels[i, j]:.1f} dB at {size}) than its own"
+        f" ({own[i]:.1f} dB)"
+        for i, (name, j) in enumerate(zip(names, best, strict=True))
+        if decibels[i, j] > own[i] + OTHER_VIEW_CLEARLY
+    ]

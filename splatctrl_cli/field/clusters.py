@@ -216,12 +216,13 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
     """
     check_labels(splats)
     chosen = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
-    if not len(chosen):
-        names = ", ".join(label.name.lower() for label in sorted(labels))
-        raise NotEvaluableError(
-            f"splats: none of {len(splats)} is labelled {names}",
-            remedy="give a scene that has some; --include takes other labels",
-        )
+    names = ", ".join(label.name.lower() for label in sorted(labels))
+    refuse_if(
+        not len(chosen),
+        f"splats: none of {len(splats)} is labelled {names}",
+        remedy="give a scene that has some; --include takes other labels",
+        error=NotEvaluableError,
+    )
     return chosen
 
 

@@ -95,12 +95,13 @@ def check_loss(voxel: float, max_loss: float) -> None:
 def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
     """Raise UsageError if a grid needs more memory than is free."""
     needed, free = bytes_per_cell * layout.num_cells, available_memory()
-    if needed > free:
-        size = " x ".join(str(n) for n in layout.shape)
-        raise UsageError(
-            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
-            remedy="give a larger --voxel or a smaller --box; the command sdf-bake keeps a grid on disk",
-        )
+    size = " x ".join(str(n) for n in layout.shape)
+    refuse_if(
+        needed > free,
+        f"grid of {size} cells: needs {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
+        remedy="give a larger --voxel or a smaller --box; the command sdf-bake keeps a grid on disk",
+        error=UsageError,
+    )
 
 
 def check_room(what: str, needed: int, remedy: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar, cast, overload
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.records import Float64, Index
 
 IN_MEMORY = 2**20  # [bytes] up to which a file is memory
@@ -51,8 +52,11 @@ class RowFile:
 
     def append(self, rows: Float64) -> None:
         block = np.ascontiguousarray(rows, dtype=self._dtype)
-        if block.shape[1:] != self.row_shape:
-            raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
+        refuse_if(
+            block.shape[1:] != self.row_shape,
+            f"rows: expected {self.row_shape}, got {block.shape[1:]}",
+            error=ValueError,
+        )
         self._waiting.append(block.tobytes())
         self._num += len(block)
         if len(block) > 1 or len(self._waiting) == BLOCK:

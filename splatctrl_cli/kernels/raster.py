@@ -69,12 +69,6 @@ class Rasteriser(PreparedView):
         self.native.project_backward(centers, radii, gradients, out)
         return out[:, :3].copy(), out[:, 3].copy()
 
-    def visible(self) -> NDArray[np.bool_]:
-        """True for splats (N,) on a tile's list."""
-        out = np.empty(len(self._inputs[1]), np.uint8)
-        self.native.visible(out)
-        return out.astype(bool)
-
 
 @dataclass(frozen=True, kw_only=True)
 class LossTerms:

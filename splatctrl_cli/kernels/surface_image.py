@@ -68,9 +68,6 @@ def render_surface(
     return SurfaceImage(depth=depth, link=link, inside=inside)
 
 
-INSIDE = 0.5  # winding number above which a point is inside
-
-
 class TriangleTree:
     """Triangles (F, 3, 3) [m], counter-clockwise from outside; open or in pieces, too."""
 
@@ -88,12 +85,6 @@ class TriangleTree:
         distance, face, shares = np.empty(len(points)), np.empty(len(points), np.int64), np.empty((len(points), 3))
         self._native.closest(points, most, distance, face, shares, self._num_threads)
         return distance, face, shares
-
-    def holds(self, points: Float64) -> Bool:
-        """Points (N, 3) [m] more than half surrounded (winding number)."""
-        number = np.empty(len(points))
-        self._native.winding(np.ascontiguousarray(points, np.float64), number, self._num_threads)
-        return np.asarray(number > INSIDE)
 
     def gaps(self, poses: Float64, centers: Floats, radii: Floats) -> tuple[Float64, Int64]:
         """Signed gap (T,) [m] from the nearest ball, negative inside, and its number (T,).

@@ -114,7 +114,12 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
         by_link[shape.link].append(_primitive(shape))
     load = cache(load_mesh)
     for mesh in urdf.meshes:
-        by_link[mesh.link] += mesh_pieces(mesh, load(mesh_path(urdf.path, mesh, folders)))
+        whole = place_mesh(mesh, load(mesh_path(urdf.path, mesh, folders)))
+        pieces = [whole] if whole.is_closed else _taken_apart(whole)
+        by_link[mesh.link] += [
+            Solid(link=mesh.link, surface=piece, slack=0.0, body=piece if piece.is_closed else _hull(piece.vertices))
+            for piece in pieces
+        ]
     return {link: tuple(solids) for link, solids in by_link.items()}
 
 
@@ -187,36 +192,22 @@ def place_mesh(shape: MeshShape, mesh: TriangleMesh) -> TriangleMesh:
     """Mesh in the link's frame. Raises InputError for an implausible length (another unit)."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     length = float(np.ptp(vertices, axis=0).max())
-    refuse_if(
-        not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1],
-        f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
-        remedy=_unit_words(shape, length),
-    )
-    return replace(
-        mesh,
-        vertices=vertices,
-        faces=np.ascontiguousarray(mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]),
-    )
-
-
-def _unit_words(shape: MeshShape, length: float) -> str:
     raw, signs = length / float(np.abs(shape.scale).max()), np.sign(shape.scale)
     words = [
         f'{name}: scale="{" ".join(f"{unit * sign:g}" for sign in signs)}"'
         for name, unit in UNITS.items()
         if LINK_LENGTHS[0] <= raw * unit < LINK_LENGTHS[1]
     ]
-    return f"looks like {', or '.join(words)}" if words else "correct its scale"
-
-
-def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
-    """Mesh's solids, link frame; an open mesh as closed pieces and rest."""
-    whole = place_mesh(shape, mesh)
-    pieces = [whole] if whole.is_closed else _taken_apart(whole)
-    return [
-        Solid(link=shape.link, surface=piece, slack=0.0, body=piece if piece.is_closed else _hull(piece.vertices))
-        for piece in pieces
-    ]
+    refuse_if(
+        not MESH_LENGTHS[0] <= length <= MESH_LENGTHS[1],
+        f"link '{shape.link}': mesh {shape.filename}: expected a length of 1 mm to 10 m, got {length:g} m",
+        remedy=f"looks like {', or '.join(words)}" if words else "correct its scale",
+    )
+    return replace(
+        mesh,
+        vertices=vertices,
+        faces=np.ascontiguousarray(mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]),
+    )
 
 
 def _taken_apart(mesh: TriangleMesh) -> Iterator[TriangleMesh]:

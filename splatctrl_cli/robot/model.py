@@ -85,9 +85,18 @@ class RobotModel:
             if frame.type == pinocchio.FrameType.BODY
         }
         self.frame_names = tuple(link for link in urdf.links if link in self._frames)
-        self._sphere_joint, self._sphere_offset = self._joint_offsets()
+        frames = [self._model.frames[self._frame(link)] for link in self.sphere_set.links]
+        offsets = [
+            frame.placement.rotation @ center + frame.placement.translation
+            for frame, center in zip(frames, self.sphere_set.centers, strict=True)
+        ]
+        self._sphere_joint: Index = np.array([frame.parentJoint for frame in frames], dtype=np.int64)
+        self._sphere_offset: Float64 = np.array(offsets, dtype=np.float64)
         self.chain = self._as_chain()
-        self.moving_spheres: Bool = self._find_moving()
+        postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
+        self.moving_spheres: Bool = np.asarray(
+            np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9
+        )
 
     @classmethod
     def from_urdf(
@@ -387,18 +396,6 @@ class RobotModel:
             sphere_body=self._sphere_joint,
             offset=np.ascontiguousarray(self._sphere_offset).reshape(-1, 3),
         )
-
-    def _joint_offsets(self) -> tuple[Index, Float64]:
-        frames = [self._model.frames[self._frame(link)] for link in self.sphere_set.links]
-        offsets = [
-            frame.placement.rotation @ center + frame.placement.translation
-            for frame, center in zip(frames, self.sphere_set.centers, strict=True)
-        ]
-        return np.array([f.parentJoint for f in frames], dtype=np.int64), np.array(offsets, dtype=np.float64)
-
-    def _find_moving(self) -> Bool:
-        postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
-        return np.asarray(np.max([np.abs(self.spheres_at(q)[1]).max(axis=(1, 2)) for q in postures], axis=0) > 1e-9)
 
     def _frame(self, frame: str) -> int:
         what, remedy = f"{self.urdf.path}: no frame '{frame}'", f"frames there: {', '.join(self.urdf.links)}"

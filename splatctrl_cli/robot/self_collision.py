@@ -26,9 +26,12 @@ def read_srdf(path: Path, urdf: UrdfFile) -> tuple[dict[frozenset[str], str], li
         f"{path}: expected an SRDF, got broken XML", ElementTree.ParseError, ValueError, remedy="give an SRDF file"
     ):
         root = ElementTree.fromstring(read_text(path, "give the robot's SRDF file"))
-    if root.tag != "robot" or root.find("link") is not None or root.find("joint") is not None:
-        got = "a URDF" if root.tag == "robot" else f"<{root.tag}>"
-        raise InputError(f"{path}: expected an SRDF, got {got}", remedy="give the file with <disable_collisions>")
+    got = "a URDF" if root.tag == "robot" else f"<{root.tag}>"
+    refuse_if(
+        root.tag != "robot" or root.find("link") is not None or root.find("joint") is not None,
+        f"{path}: expected an SRDF, got {got}",
+        remedy="give the file with <disable_collisions>",
+    )
     known: dict[frozenset[str], str] = {}
     foreign: list[tuple[str, str]] = []
     for element in root.findall("disable_collisions"):

@@ -126,7 +126,15 @@ class SelfSurfaces:
         ).reshape(-1, 2)
         off = {*disabled, *joined_links(model, tuple(solids))}
         candidates = [(a, b) for a, b in combinations(solids, 2) if frozenset((a, b)) not in off]
-        self.fused = self._never_apart(candidates, recorded)
+        postures = random_postures(self._model, SELF_TOUCHING, seed=0)
+        if recorded is not None:
+            postures = np.concatenate([recorded, postures])
+        bounds = self._bounds(candidates, self._model.sphere_centers_batch(postures)).max(axis=0)
+        self.fused = tuple(
+            pair
+            for pair, bound in zip(candidates, bounds, strict=True)
+            if bound <= 0 and all(self.gap(q, pair) <= 0 for q in postures)
+        )
         self.pairs: tuple[LinkNames, ...] = tuple(pair for pair in candidates if pair not in self.fused)
         self.names = tuple(f"{a} and {b}" for a, b in (*self.pairs, *((links[a], links[b]) for a, b in self._bare)))
 
@@ -174,17 +182,6 @@ class SelfSurfaces:
         a, b = (self._surfaces[link] for link in pair)
         T_world_a, T_world_b = (self._model.frame_pose(q, link) for link in pair)
         return surface_gap(a, b, invert_transform(T_world_a) @ T_world_b)
-
-    def _never_apart(self, pairs: Sequence[LinkNames], recorded: Float64 | None) -> tuple[LinkNames, ...]:
-        postures = random_postures(self._model, SELF_TOUCHING, seed=0)
-        if recorded is not None:
-            postures = np.concatenate([recorded, postures])
-        bounds = self._bounds(pairs, self._model.sphere_centers_batch(postures)).max(axis=0)
-        return tuple(
-            pair
-            for pair, bound in zip(pairs, bounds, strict=True)
-            if bound <= 0 and all(self.gap(q, pair) <= 0 for q in postures)
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from splatctrl_cli.errors import InputError, refuse_if
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.records import Array, Float32, Float64, UInt8
 from splatctrl_cli.robot.coverage import areas
 from splatctrl_cli.robot.surface import RobotSurface
@@ -128,12 +128,12 @@ class SelfModel:
     def check_robot(self, surface: RobotSurface, links: Sequence[str], path: Path) -> None:
         """Raise InputError if file `path` belongs to a robot of other links or visual surface."""
         other = ", ".join(sorted(set(self.links) ^ set(links))[:4])
-        if other or self.digest != surface_digest(surface):
-            difference = f"one of the two lacks {other}" if other else "its visual geometry differs"
-            raise InputError(
-                f"{path}: self-model of another robot: {difference}",
-                remedy="learn it again with this URDF, or give the robot that it was learned for",
-            )
+        difference = f"one of the two lacks {other}" if other else "its visual geometry differs"
+        refuse_if(
+            other or self.digest != surface_digest(surface),
+            f"{path}: self-model of another robot: {difference}",
+            remedy="learn it again with this URDF, or give the robot that it was learned for",
+        )
 
 
 def surface_digest(surface: RobotSurface) -> str:

@@ -29,12 +29,12 @@ RENAMED = (
 def spheres_of(urdf: UrdfFile) -> SphereSet:
     """`own_spheres`. Raises InputError without any."""
     spheres = own_spheres(urdf)
-    if not len(spheres.radii):
-        others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
-        raise InputError(
-            f"{urdf.path}: expected collision geometry of spheres only, got {others} other shapes",
-            remedy="give a spheres YAML file, or fit one with: splatctrl robot spheres",
-        )
+    others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
+    refuse_if(
+        not len(spheres.radii),
+        f"{urdf.path}: expected collision geometry of spheres only, got {others} other shapes",
+        remedy="give a spheres YAML file, or fit one with: splatctrl robot spheres",
+    )
     return spheres
 
 
@@ -169,9 +169,8 @@ def read_sphere_file(path: Path) -> SphereFile:
         for index, sphere in enumerate(_check_list(source, link, spheres))
     ]
     on = [(link, (*row[:3], row[3] + buffer)) for link, row, buffer in rows if row[3] + buffer > 0]
-    if not on:
-        off = f", all {len(rows)} of radius 0 or less" if rows else ""
-        raise InputError(f"{source}: expected collision spheres, got none{off}", remedy=LAYOUT)
+    off = f", all {len(rows)} of radius 0 or less" if rows else ""
+    refuse_if(not on, f"{source}: expected collision spheres, got none{off}", remedy=LAYOUT)
     numbers = np.array([row for _, row in on], dtype=np.float64)
     return SphereFile(
         path=path,

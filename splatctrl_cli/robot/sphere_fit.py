@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
-from splatctrl_cli.errors import UsageError, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_if, require
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refine_triangles
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
@@ -151,14 +151,14 @@ class _Link:
 
     def within(self, max_protrusion: float) -> tuple[Float64, Float64]:
         """Few spheres within a protrusion. Raises UsageError where the patches are too coarse."""
-        cover = self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1])
-        if cover is None:
-            least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
-            raise UsageError(
-                f"sphere fit: link '{self.name}': largest protrusion: expected at least {1e3 * least:.1f} mm, "
-                f"got {1e3 * max_protrusion:g} mm",
-                remedy="allow more",
-            )
+        least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
+        cover = require(
+            self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1]),
+            f"sphere fit: link '{self.name}': largest protrusion: expected at least {1e3 * least:.1f} mm, "
+            f"got {1e3 * max_protrusion:g} mm",
+            remedy="allow more",
+            error=UsageError,
+        )
         return self.round_outward(*self.improve(cover))
 
     def refine(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:

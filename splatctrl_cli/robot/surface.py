@@ -75,7 +75,7 @@ class RobotSurface:
         balls = [_ball(link, center, radius) for link, center, radius in rows if link in by_spheres]
         drawn = [(link, corners) for link, corners in pieces if link not in by_spheres]
         bodies = urdf.rigid_bodies()
-        children = {child for _, child in urdf.parents}
+        children = {joint.child for joint in urdf.joints}
         surface = cls.from_parts(
             [*shapes, *balls],
             drawn,

@@ -70,11 +70,6 @@ class UrdfFile:
     solid_links: tuple[str, ...]
 
     @property
-    def parents(self) -> tuple[tuple[str, str], ...]:
-        """(parent, child) links of the joints."""
-        return tuple((joint.parent, joint.child) for joint in self.joints)
-
-    @property
     def root(self) -> str:
         """The link that no joint moves."""
         children = {joint.child for joint in self.joints}

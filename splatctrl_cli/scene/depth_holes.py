@@ -46,7 +46,9 @@ def unanswered_points(
     behind = _nearest_depth(frame.depth)
     width = config.voxel * frame.intrinsics.fx / float(np.median(behind[holes]))
     apart = max(int(width), 1)
-    v, u = np.nonzero(_wide(holes, fixed.NARROW_HOLE * width)[::apart, ::apart])
+    side = int(fixed.NARROW_HOLE * width) | 1  # OpenCV shifts an even window
+    opened = cv2.morphologyEx(holes.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    v, u = np.nonzero(opened[::apart, ::apart])
     return points_on_rays(frame, v * apart, u * apart, behind[v * apart, u * apart], config)
 
 
@@ -71,12 +73,6 @@ def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
     return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
-
-
-def _wide(pixels: Bool, width: float) -> Bool:
-    side = int(width) | 1  # OpenCV shifts an even window
-    opened = cv2.morphologyEx(pixels.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
-    return np.asarray(opened.view(bool))
 
 
 def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:

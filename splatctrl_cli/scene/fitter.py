@@ -12,13 +12,12 @@ from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
-from splatctrl_cli.scene.backdrop import backdrop_seeds
+from splatctrl_cli.scene.backdrop import Shell, backdrop_seeds
 from splatctrl_cli.scene.buffer import BACKDROP, Filled, Seeds, SplatBuffer
-from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.contradicted import mask_frames, take_in_evidence
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.keyframes import View, Window, make_view, move_to_surface, seen_through, shrink_radii
-from splatctrl_cli.scene.labels import Seen, relabel
+from splatctrl_cli.scene.labels import Seen, contact_seeds, hidden_objects, lasts_at_fixed_links, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carry_splats
@@ -42,7 +41,6 @@ from splatctrl_cli.scene.self_mask import (
     label_pixels,
     object_mask,
 )
-from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.surface_depth import object_twice, steady_depth
 from splatctrl_cli.scene.time_steps import AuditRow, Refined
 from splatctrl_cli.scene.unrepresented import bare_voxels, confirm_bare, unrepresented_voxels

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from splatctrl_cli.config import OccupancyConfig, fixed
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Index, Label, RgbdFrame, UInt8, UInt16
 from splatctrl_cli.voxels import (
@@ -34,12 +34,13 @@ class OccupancyMap:
         self.num_threads = num_threads
         extent = workspace.upper - workspace.lower
         shape = tuple(int(n) for n in np.maximum(np.ceil(extent / config.voxel), 1))
-        if np.prod([float(n) for n in shape]) > MOST_VOXELS:
-            size = " x ".join(f"{e:.1f}" for e in extent)
-            raise UsageError(
-                f"workspace of {size} m: too large for {config.voxel} m voxels",
-                remedy="give --box, or a larger occupancy.voxel",
-            )
+        size = " x ".join(f"{e:.1f}" for e in extent)
+        refuse_if(
+            np.prod([float(n) for n in shape]) > MOST_VOXELS,
+            f"workspace of {size} m: too large for {config.voxel} m voxels",
+            remedy="give --box, or a larger occupancy.voxel",
+            error=UsageError,
+        )
         self.origin: Float64 = workspace.lower + 0.5 * config.voxel
         self.log_odds: Float32 = np.zeros(shape, np.float32)
         self.num_updates: UInt16 = np.zeros(shape, np.uint16)

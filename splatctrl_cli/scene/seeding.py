@@ -228,7 +228,9 @@ def gap_seeds(
     sources = [source for source in each(lambda view: bare(*view), views) if len(source)]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
-        sources.append(_voxel_seeds(forgotten, splats))
+        grey = np.full((len(forgotten), 3), 0.5, np.float32)
+        colors = splats.colors[cKDTree(splats.centers).query(forgotten)[1]] if len(splats) else grey
+        sources.append(Seeds(centers=forgotten, radii=np.zeros(len(forgotten), np.float32), colors=colors))
     if not sources:
         return NO_SEEDS
     cloud = sources[0].joined(*sources[1:])
@@ -241,12 +243,6 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     depth = frame.depth[::8, ::8]
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
-
-
-def _voxel_seeds(centers: Float32, splats: SplatSet) -> Seeds:
-    grey = np.full((len(centers), 3), 0.5, np.float32)
-    colors = splats.colors[cKDTree(splats.centers).query(centers)[1]] if len(splats) else grey
-    return Seeds(centers=centers, radii=np.zeros(len(centers), np.float32), colors=colors)
 
 
 def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:

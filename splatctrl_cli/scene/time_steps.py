@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import refuse_if
 from splatctrl_cli.records import Box, Float32, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled
 from splatctrl_cli.scene.seeding import thin_mask, thinning, world_points
@@ -166,12 +166,12 @@ def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0)
     points = [world_points(frame, thin_mask(mask, every)) for frame, mask in zip(frames, masks, strict=True)]
     joined = np.concatenate(points)
     del points
-    if not len(joined):
-        names = ", ".join(sorted({frame.camera for frame in frames}))
-        raise InputError(
-            f"camera {names}: no valid depth within {max_range} m in the first frames",
-            remedy="check the depth topic and scale, raise occupancy.max_range, or give a --box",
-        )
+    names = ", ".join(sorted({frame.camera for frame in frames}))
+    refuse_if(
+        not len(joined),
+        f"camera {names}: no valid depth within {max_range} m in the first frames",
+        remedy="check the depth topic and scale, raise occupancy.max_range, or give a --box",
+    )
     lower, upper = np.percentile(joined, [0.5, 99.5], axis=0)
     margin = 0.02 * (upper - lower) + 0.02 * scale
     return Box(lower=lower - margin, upper=upper + margin)

@@ -196,8 +196,8 @@ class Recording:
         """Parent link -> link, except the root, at q (J,)."""
         poses = self.link_poses(q)
         return [
-            (parent, child, invert_transform(poses[parent]) @ poses[child])
-            for parent, child in self.robot.urdf.parents
+            (joint.parent, joint.child, invert_transform(poses[joint.parent]) @ poses[joint.child])
+            for joint in self.robot.urdf.joints
         ]
 
     def clearances(self) -> tuple[np.ndarray, Float64]:

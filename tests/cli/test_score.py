@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.evaluate.score_report import other_scans
+from splatctrl_cli.evaluate.score import other_scans
 from splatctrl_cli.recording.folder.dtu import read_dtu
 from splatctrl_cli.recording.folder.idr import write_idr
 from splatctrl_cli.records import LossReport

@@ -10,7 +10,7 @@ from splatctrl_cli.cli.scene_options import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import FIELDS, metric_scales
-from splatctrl_cli.field import baker, distance, probability, weights
+from splatctrl_cli.field import baker, distance, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid_cells import exact_channel
 from splatctrl_cli.formats.grid import grid_format, grid_formats
@@ -143,7 +143,7 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(distance.KERNEL_OF) == FieldConfig.declared["distance"].words
     assert tuple(weights.METHODS) == FieldConfig.declared["weights"].words
-    assert tuple(probability.PROBABILITIES) == FieldConfig.declared["probability"].words
+    assert tuple(distance.PROBABILITIES) == FieldConfig.declared["probability"].words
     assert tuple(qp.SOLVERS) == ControlConfig.declared["solver"].words
     assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
     assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(grid_format.CHANNELS) == scene_options.CHANNELS

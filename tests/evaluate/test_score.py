@@ -8,18 +8,18 @@ import pytest
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate import score_report
 from splatctrl_cli.evaluate.score import (
     CORRECTABLE,
     CORRECTED,
+    Doubts,
     as_json,
+    counts_of,
     free_mass,
     metric_scales,
     score_view,
     share_in_front,
     total_score,
 )
-from splatctrl_cli.evaluate.score_report import Doubts
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, Label, RgbdFrame
@@ -131,10 +131,10 @@ def test_the_names_of_the_totals_are_known_beforehand() -> None:
 def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:
     views = [{"psnr_seen": 20.0, "in_front_seen": None}, {"psnr_seen": 21.0, "in_front_seen": 0.0}]
     metrics = {"num_views": 2, "psnr_seen": 20.5, "in_front_seen": 0.0, "num_warnings": 0, "change_psnr_seen": 0.1}
-    counts = score_report.counts_of({"metrics": metrics, "views": views})
+    counts = counts_of({"metrics": metrics, "views": views})
     assert counts == {"num_views": 2, "psnr_seen": 2, "in_front_seen": 1, "num_warnings": 2, "change_psnr_seen": 2}
     both = {"metrics": metrics | {"num_views": 4}, "results": {"a": {"views": views}, "b": {"views": views}}}
-    assert score_report.counts_of(both)["in_front_seen"] == 2
+    assert counts_of(both)["in_front_seen"] == 2
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,15 @@ from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
-from splatctrl_cli.field.report import grid_statistics
-from splatctrl_cli.field.slabs import UnknownSpace, bake, bake_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.field.slabs import (
+    UnknownSpace,
+    bake,
+    bake_planes,
+    bytes_per_cell,
+    check_slab_memory,
+    grid_statistics,
+    slabs,
+)
 from splatctrl_cli.formats.grid.npz_grid import write_npz
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.voxels import SWEPT, OccupancyGrid

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.baker import Baker, Changes, changed_blocks, counts_after
 from splatctrl_cli.field.grid_cells import GridLayout
-from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.records import Box, Label, SplatSet
 from tests.field.scenes import cloud, splat_set
 

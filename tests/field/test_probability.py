@@ -4,10 +4,10 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import field_over
-from splatctrl_cli.field.probability import (
+from splatctrl_cli.field.distance import (
     CalibratedProbability,
     PaperProbability,
+    field_over,
     probability_of_occupancy,
 )
 from splatctrl_cli.field.slabs import bake

@@ -4,7 +4,8 @@ import numpy as np
 
 from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.kernels import points as kernels
-from splatctrl_cli.kernels.raster import Float32, Float64, pack_camera
+from splatctrl_cli.kernels.raster import Float32, Float64, Rasteriser, pack_camera
+from splatctrl_cli.records import Bool
 
 STILL = np.eye(4)
 Arrays = tuple[Float32, Float32, Float32, Float32]
@@ -22,6 +23,13 @@ def splats(count: int = 60, seed: int = 0) -> Arrays:
     radii = rng.uniform(0.01, 0.08, count).astype(np.float32)
     opacities = rng.uniform(0.02, 0.98, count).astype(np.float32)
     return centers, radii, opacities, rng.uniform(0, 1, (count, 3)).astype(np.float32)
+
+
+def visible(raster: Rasteriser) -> Bool:
+    """Splats (N,) with a part in the view that `raster` has prepared."""
+    out = np.empty(len(raster._inputs[1]), np.uint8)
+    raster.native.visible(out)
+    return out.astype(bool)
 
 
 def points_bytes() -> bytes:

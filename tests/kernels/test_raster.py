@@ -6,7 +6,7 @@ import torch
 
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.kernels.raster import Float32, Float64, Rasteriser, empty_planes, pack_camera
-from tests.kernels.scenes import Arrays, camera, splats
+from tests.kernels.scenes import Arrays, camera, splats, visible
 from tests.reference import raster as reference
 
 
@@ -106,7 +106,7 @@ def test_unseeable_splats_are_left_out() -> None:
     opacities = np.float32([0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.001])
     view = pack_camera(100.0, 100.0, 20.0, 15.0, 41, 31, np.eye(4))
     raster, planes = rendered((centers, radii, opacities, np.ones((7, 3), np.float32)), view)
-    assert not raster.visible().any()
+    assert not visible(raster).any()
     assert not planes.any()
     assert not raster.backward(planes, np.ones_like(planes)).any()
     assert not rendered(splats(0), view)[1].any()

@@ -13,9 +13,9 @@ from splatctrl_cli.config.fixed import CONTACT_REACH, ROBOT_REACH
 from splatctrl_cli.records import Box, Label, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations, DeclaredContact
 from splatctrl_cli.scene import fitter as fitter_module
-from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.keyframes import shrink_radii
+from splatctrl_cli.scene.labels import contact_pixels, count_carried, hidden_objects, lasts_at_fixed_links
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask

@@ -9,12 +9,12 @@ from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.formats.splat.splats import check_splats
 from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, RgbdFrame, SplatSet
+from splatctrl_cli.scene.backdrop import pixels_beyond
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import BLACK, render
 from splatctrl_cli.scene.seeding import world_points
-from splatctrl_cli.scene.shell import pixels_beyond
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 REACH = Box(lower=np.array([-0.2, -0.35, -0.05]), upper=np.array([0.2, 0.35, 0.6]))  # the floor is seen to 0.49 m

@@ -253,7 +253,15 @@ class GridSlabs:
                 f"slab: {name} at layer {self.num_layers} of {self.plan.shape[0]}: expected {expected}, "
                 f"got {(values.dtype.str, values.shape)}",
             )
-            self._write_channel(name, values)
+            path = self.folder / f"{name}.npy"
+            layer = np.dtype(CHANNELS[name].dtype).itemsize * int(
+                np.prod(CHANNELS[name].shape((1, *self.plan.shape[1:])))
+            )
+            with path.open("r+b") as stream:
+                stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))
+                stream.write(np.ascontiguousarray(values).data)
+                stream.flush()
+                os.fsync(stream.fileno())
         self.num_layers += num
         self.counts = counts or {}
         _write_progress(self.folder, self.plan, self.num_layers, self.counts)
@@ -277,17 +285,6 @@ class GridSlabs:
             channels=channels,
             header=dict(header),
         )
-
-    def _write_channel(self, name: str, values: Values) -> None:
-        path = self.folder / f"{name}.npy"
-        layer = np.dtype(CHANNELS[name].dtype).itemsize * int(
-            np.prod(CHANNELS[name].shape((1, *self.plan.shape[1:])))
-        )
-        with path.open("r+b") as stream:
-            stream.seek(path.stat().st_size - layer * (self.plan.shape[0] - self.num_layers))
-            stream.write(np.ascontiguousarray(values).data)
-            stream.flush()
-            os.fsync(stream.fileno())
 
 
 def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:

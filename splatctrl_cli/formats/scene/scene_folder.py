@@ -360,9 +360,6 @@ class SplatFile(SceneFolder):
     def snapshots(self) -> tuple[Snapshot, ...]:
         return ()
 
-    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        return None
-
 
 def open_splats(path: Path) -> SceneFolder:
     """Open a scene folder or splat file. Raises InputError for neither."""

@@ -18,11 +18,10 @@ from splatctrl_cli.evaluate.field_accuracy import (
 from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
+from splatctrl_cli.field.baker import Changes
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.field.distance import KERNEL_OF
+from splatctrl_cli.field.distance import KERNEL_OF, probabilities
 from splatctrl_cli.field.grid_cells import LOSS, exact_channel
-from splatctrl_cli.field.incremental import Changes
-from splatctrl_cli.field.probability import probabilities
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame

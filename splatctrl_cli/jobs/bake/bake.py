@@ -14,11 +14,9 @@ from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names
-from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker, Changes, changed_blocks, counts_after
 from splatctrl_cli.field.clusters import ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.grid_cells import GridLayout, check_loss, check_room
-from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import (
     EarlierBake,
     UnknownSpace,
@@ -26,6 +24,7 @@ from splatctrl_cli.field.slabs import (
     bytes_per_cell,
     check_slab_memory,
     field_header,
+    grid_statistics,
     slabs,
 )
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, remove, write_json, write_run

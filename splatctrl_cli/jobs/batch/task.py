@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from splatctrl_cli.files.output import partial_path, remove, write_durably
-from splatctrl_cli.kernels.cuda.driver import num_cards
+from splatctrl_cli.kernels.cuda.memory import num_cards
 
 Entry = Callable[[list[str]], int]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate import field_accuracy, score_report
+from splatctrl_cli.evaluate import field_accuracy, score
 from splatctrl_cli.evaluate.field_accuracy import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale
 from splatctrl_cli.evaluate.verdict import damage_mark
@@ -37,7 +37,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
     return {
         "reconstruct": reconstruct_verdict.GATED,
         "sdf-bake": SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS),
-        "score": score_report.SCALES,
+        "score": score.SCALES,
         "replay": {name: scale for scales in by_mode for name, scale in scales.items()},
         "robot": robot.SCALES,
     }

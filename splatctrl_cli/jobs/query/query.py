@@ -17,9 +17,8 @@ from splatctrl_cli.control.audit import observed_at
 from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.field.clusters import DEFAULT_LABELS, ObstacleSpheres, Spheres, obstacle_spheres
-from splatctrl_cli.field.distance import OnDevice, SphereField, field_over, march
+from splatctrl_cli.field.distance import PROBABILITIES, OnDevice, SphereField, field_over, march
 from splatctrl_cli.field.grid_cells import GridField, check_room
-from splatctrl_cli.field.probability import PROBABILITIES
 from splatctrl_cli.files.output import Parts, Stopwatch, output_path
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.ply import point_blocks

@@ -27,8 +27,8 @@ from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
-from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.labels import count_carried
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.scale import RecordedDepth, describe_scale, fitted_to
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics

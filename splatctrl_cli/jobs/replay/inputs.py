@@ -204,7 +204,7 @@ def bare_moving_links(model: RobotModel) -> list[str]:
     if model.coverage is None:
         return []
     bodies = model.urdf.rigid_bodies()
-    children = {child for _, child in model.urdf.parents}
+    children = {joint.child for joint in model.urdf.joints}
     return [link for link in model.coverage.bare_links if bodies[link][0] in children]
 
 

@@ -10,9 +10,8 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import CARD_LEAST_WORK
 from splatctrl_cli.errors import DeviceFault, DeviceFull, UsageError, refuse_if
 from splatctrl_cli.jobs.running.progress import Progress
-from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.fit import DeviceFit, bytes_needed
-from splatctrl_cli.kernels.cuda.memory import FIELD, FIT, DeviceError, Memory, OutOfMemory
+from splatctrl_cli.kernels.cuda.memory import FIELD, FIT, Card, DeviceError, Memory, OutOfMemory, usable_card
 from splatctrl_cli.libraries import is_installed
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter

@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError, refuse_if
-from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
-from splatctrl_cli.evaluate.score_report import (
+from splatctrl_cli.evaluate.score import (
     AVERAGING,
     NAMES,
     NAMES_WITH_CHANGES,
     PREFIX,
+    PROTOCOL,
+    as_json,
     changes,
+    free_mass,
     read_baseline,
     report_of_scans,
     score_verdict,
+    total_score,
 )
 from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names
 from splatctrl_cli.field.clusters import field_splats, obstacle_spheres

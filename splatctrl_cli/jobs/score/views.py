@@ -16,8 +16,7 @@ from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
-from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, score_view
-from splatctrl_cli.evaluate.score_report import Doubts
+from splatctrl_cli.evaluate.score import CORRECTABLE, CORRECTED, Doubts, score_view
 from splatctrl_cli.evaluate.views import View, seen_by, seen_pixels, surface_points, views_to_score
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.formats.mesh import load_mesh

@@ -12,8 +12,7 @@ from cuda.bindings import driver
 from cuda.core import Device, LaunchConfig, ObjectCode, Program, ProgramOptions, launch
 from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
 
-from splatctrl_cli.kernels.cuda.driver import Card, usable_card
-from splatctrl_cli.kernels.cuda.memory import FIT, Array, DeviceError, Graph, Launch, OutOfMemory
+from splatctrl_cli.kernels.cuda.memory import FIT, Array, Card, DeviceError, Graph, Launch, OutOfMemory, usable_card
 
 HERE = Path(__file__).parent
 FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.kernels import Float32, Float64, Int32
+from splatctrl_cli.kernels import Float32, Float64
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Moments, OptimiserSettings, TargetView
 
@@ -179,20 +179,6 @@ class DeviceFit:
             self._graph(height, width, "render").run()
             if self._fits():
                 return self.read_image("planes", view, 5)
-
-    def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
-        """Derivatives (N, 8) of a view's loss by the parameters, which stay, and the loss."""
-        height, width = self.views[view].target.depth.shape
-        while True:
-            self.rewind([view], weights, settings, 0)
-            self._graph(height, width, "gradients").run()
-            if self._fits():
-                return self._read("gradients", (self.num_splats, 8)), self._terms([view])[view]
-
-    def list_lengths(self, view: int) -> Int32:
-        """Number of splats (K,) on each tile's list, after the last launch."""
-        height, width = self.views[view].target.depth.shape
-        return self._read(f"num_entries {height} {width}", (-(-height // TILE) * -(-width // TILE),), np.int32)
 
     def read_image(self, name: str, view: int, channels: int) -> Float32:
         """Read `planes`, `plane_gradients` or `maps` (channels, H, W), after the last launch."""

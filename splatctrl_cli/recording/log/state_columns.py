@@ -42,8 +42,7 @@ class StateColumns(Sequence[JointState]):
             first, last, step = index.indices(len(self))
             return self.states(first, last)[::step] if step > 0 else [self[i] for i in range(first, last, step)]
         number = index + (len(self) if index < 0 else 0)
-        if not 0 <= number < len(self):
-            raise IndexError(f"state {index} of {len(self)}")
+        refuse_if(not 0 <= number < len(self), f"state {index} of {len(self)}", error=IndexError)
         return self.states(number, number + 1)[0]
 
     def __iter__(self) -> Iterator[JointState]:

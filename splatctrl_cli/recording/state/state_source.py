@@ -110,13 +110,10 @@ def _open_log_states(
         damaged=log_survey.damage.count, notes=[*log_survey.damage.all_notes, f"no camera is used: {reason.message}"]
     )
     names, states = joint_records(log_survey, options, loss, joints)
-    if not states:
-        topics = ", ".join(
-            f"{name} ({t.topic.type_name})" for name, t in sorted(log_survey.topics.items()) if t.count
-        )
-        raise InputError(
-            f"{path}: expected joint states, got none", remedy=f"the log holds {topics or 'no messages'}"
-        )
+    topics = ", ".join(f"{name} ({t.topic.type_name})" for name, t in sorted(log_survey.topics.items()) if t.count)
+    refuse_if(
+        not states, f"{path}: expected joint states, got none", remedy=f"the log holds {topics or 'no messages'}"
+    )
     return StateSource(path.name, log.files, names, states, loss)
 
 
@@ -202,12 +199,12 @@ def _read_logged(path: Path, topic: str) -> LoggedTwists:
         log_times.append(message.log_time_ns)
         stamps.append(stamp_ns(content.header) if kind == STAMPED else 0)
         frames.append(content.header.frame_id.strip("/") if kind == STAMPED else "")
-    if not twists:
-        twist_topics = ", ".join(sorted(name for name, kind in kinds.items() if kind in (TWIST, STAMPED)))
-        raise InputError(
-            f"{path}: topic {topic}: expected {STAMPED} or {TWIST}, got {kinds.get(topic, 'no message')}",
-            remedy=f"topics with twists: {twist_topics or 'none'}",
-        )
+    twist_topics = ", ".join(sorted(name for name, kind in kinds.items() if kind in (TWIST, STAMPED)))
+    refuse_if(
+        not twists,
+        f"{path}: topic {topic}: expected {STAMPED} or {TWIST}, got {kinds.get(topic, 'no message')}",
+        remedy=f"topics with twists: {twist_topics or 'none'}",
+    )
     notes = [f"{len(damage.notes)} messages do not decode: left out"] if damage.count else []
     if not any(stamps):
         notes.append("stamps are the times of logging")

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batch.task import End, Task, run_task, stop_runners
 from splatctrl_cli.jobs.running.progress import SILENT
-from splatctrl_cli.kernels.cuda import driver
+from splatctrl_cli.kernels.cuda import memory as driver
 from tests.jobs.bake.baked import Said
 from tests.jobs.batch.desk import ENTRY, batch_of, node, states
 

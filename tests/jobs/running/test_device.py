@@ -16,9 +16,8 @@ from splatctrl_cli.jobs.bake import request as bake_request
 from splatctrl_cli.jobs.query import query
 from splatctrl_cli.jobs.running import device
 from splatctrl_cli.jobs.running.device import Device
-from splatctrl_cli.kernels.cuda import driver
-from splatctrl_cli.kernels.cuda.driver import Card
-from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Memory
+from splatctrl_cli.kernels.cuda import memory as driver
+from splatctrl_cli.kernels.cuda.memory import Array, Card, DeviceError, Memory
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.cli.test_reconstruct import contents, write_folder
 from tests.field.scenes import queries
@@ -229,10 +228,10 @@ def test_a_card_that_cannot_be_used_is_refused_before_anything_is_read(
 ) -> None:
     is_installed, fake, message = REFUSED[case]
     monkeypatch.setattr(device, "is_installed", lambda module: bool(is_installed))
-    monkeypatch.setattr("splatctrl_cli.kernels.cuda.driver.LIBRARY", "libcuda_of_no_machine.so.1")
+    monkeypatch.setattr("splatctrl_cli.kernels.cuda.memory.LIBRARY", "libcuda_of_no_machine.so.1")
     if fake is not None:
         fake.install(monkeypatch)
-        monkeypatch.setattr("splatctrl_cli.kernels.cuda.driver.LIBRARY", "libcuda.so.1")
+        monkeypatch.setattr("splatctrl_cli.kernels.cuda.memory.LIBRARY", "libcuda.so.1")
     assert main(["reconstruct", str(views), "-o", str(tmp_path / "out"), "--device", "cuda"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line and line.endswith("or give --device cpu")

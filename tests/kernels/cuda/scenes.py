@@ -17,6 +17,7 @@ from splatctrl_cli.kernels.raster import (
     pack_camera,
     unpack_parameters,
 )
+from tests.kernels.scenes import visible
 
 WEIGHTS = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=True, background=(0.9, 0.2, 0.5))
 SETTINGS = OptimiserSettings(
@@ -88,7 +89,7 @@ class OnProcessor:
             [centers, (radii * radius)[:, None], by_footprint[:, 7:10],
              ((by_footprint[:, 6] + np.float32(regulariser)) * slope)[:, None]], axis=1,
         )  # fmt: skip
-        out[~self.raster.visible()] = 0.0
+        out[~visible(self.raster)] = 0.0
         return out
 
     def step(self, plane_gradients: Float32, state: Moments, settings: OptimiserSettings, seed: int) -> None:

@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.kernels.cuda import driver
-from splatctrl_cli.kernels.cuda.driver import usable_card
-from splatctrl_cli.kernels.cuda.memory import DeviceError
+from splatctrl_cli.kernels.cuda import memory as driver
+from splatctrl_cli.kernels.cuda.memory import DeviceError, usable_card
 from tests.refused import expect_refusal
 
 

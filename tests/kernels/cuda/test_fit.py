@@ -10,9 +10,10 @@ import torch
 
 from splatctrl_cli.kernels.cuda.fit import LIST_CAPACITY, DeviceFit, bytes_needed
 from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory, OutOfMemory
-from splatctrl_cli.kernels.raster import Float32, LossTerms, LossWeights, TargetView
+from splatctrl_cli.kernels.raster import Float32, LossTerms, LossWeights, OptimiserSettings, TargetView
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.scenes import SETTINGS, WEIGHTS, OnProcessor, camera, moments, parameters, target
+from tests.kernels.scenes import visible
 from tests.reference import loss as loss_reference
 from tests.reference import raster as raster_reference
 from tests.refused import expect_refusal
@@ -24,6 +25,16 @@ def error(got: Float32, want: Float32) -> float:
     """|got - want| / |want|, over everything; not a number where anything is not."""
     difference = got.astype(np.float64) - want
     return float(np.linalg.norm(difference) / max(np.linalg.norm(want.astype(np.float64)), 1e-12))
+
+
+def derivatives(fit: DeviceFit, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
+    """Of the first view's loss by the parameters (N, 8), which stay, and the loss."""
+    height, width = fit.views[0].target.depth.shape
+    while True:
+        fit.rewind([0], weights, settings, 0)
+        fit._graph(height, width, "gradients").run()
+        if fit._fits():
+            return fit._read("gradients", (fit.num_splats, 8)), fit._terms([0])[0]
 
 
 def opaque(count: int) -> Float32:
@@ -103,7 +114,7 @@ def test_loss_and_its_derivative_equal_those_of_the_processor(case: str, device:
     weights, seen = losses()[case]
     p = SCENES["small"]
     fit = fitted(device, p, seen=seen)
-    _, terms = fit.gradients(0, weights, SETTINGS)
+    _, terms = derivatives(fit, weights, SETTINGS)
     gradient = fit.read_image("plane_gradients", 0, 5)
     for c in range(3):  # the background's share is added where the derivative is read
         gradient[4] -= np.float32(weights.background[c]) * gradient[c]
@@ -115,7 +126,7 @@ def test_loss_and_its_derivative_equal_those_of_the_processor(case: str, device:
 @pytest.mark.parametrize("scene", ["small", "opaque", "huge"])
 def test_gradients_equal_those_of_the_processor(scene: str, device: Memory) -> None:
     p = SCENES[scene]
-    gradients, _ = fitted(device, p).gradients(0, WEIGHTS, SETTINGS)
+    gradients, _ = derivatives(fitted(device, p), WEIGHTS, SETTINGS)
     want_planes, _ = OnProcessor(p, camera()).loss(target(), WEIGHTS)
     want = OnProcessor(p, camera()).gradients(want_planes, SETTINGS.regulariser)
     assert [error(gradients[:, k], want[:, k]) < BACKWARD for k in range(8)] == [True] * 8
@@ -125,7 +136,7 @@ def test_gradients_equal_those_of_the_processor(scene: str, device: Memory) -> N
 def test_gradients_equal_autograd_of_the_references(device: Memory) -> None:
     p = distinct(60)
     seen, weights = target(), replace(WEIGHTS, normalised=False)
-    gradients, _ = fitted(device, p).gradients(0, weights, replace(SETTINGS, regulariser=0.0))
+    gradients, _ = derivatives(fitted(device, p), weights, replace(SETTINGS, regulariser=0.0))
     leaf = torch.tensor(p.astype(np.float64), requires_grad=True)
     planes = raster_reference.render(
         torch.tensor(camera()), leaf[:, :3], leaf[:, 3].exp(), leaf[:, 7].sigmoid(), leaf[:, 4:7]
@@ -205,7 +216,7 @@ def test_a_run_whose_lists_were_too_short_is_repeated(device: Memory) -> None:
 
 def test_splats_out_of_view_keep_their_bytes(device: Memory) -> None:
     p = SCENES["small"]
-    unseen = ~OnProcessor(p, camera()).raster.visible()
+    unseen = ~visible(OnProcessor(p, camera()).raster)
     fit = fitted(device, p)
     fit.run([0], WEIGHTS, SETTINGS, 1)
     got, state = np.empty_like(p), moments(len(p))
