@@ -370,7 +370,10 @@ def _agrees_better(
 
 
 def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float]:
-    """Share of the misfit (K,) gained, and that by its standard error over tiles (K,); 0 without common points."""
+    """Share of the misfit (K,) gained, and its ratio (K,) to its standard error over tiles.
+
+    Both are 0 without common points.
+    """
     is_known = np.isfinite(before) & np.isfinite(after)
     gain, of_tile = (before - after)[is_known], np.unique(tiles[is_known], return_inverse=True)[1]
     if not gain.any():

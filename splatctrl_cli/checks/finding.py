@@ -36,7 +36,7 @@ class Check:
 
     @property
     def docs(self) -> str:
-        """Its line in docs/check.md: code and severity, a bar, meaning."""
+        """The row in docs/check.md: code and severity, a bar, meaning."""
         return f"`{self.code}` ({'/'.join(self.severities)}) | {self.meaning}"
 
 
@@ -212,9 +212,9 @@ class Rate:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """A checked recording: findings, rates by topic; lacks: by later command what it misses, "" for nothing.
+    """A checked recording.
 
-    frames: reduced views, without colour, of cameras with poses.
+    lacks: missing data by later command, "" for none. frames: reduced views, without colour, of posed cameras.
     """
 
     path: str

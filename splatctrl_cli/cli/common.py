@@ -356,7 +356,7 @@ class Console:
     def show(
         self, result: Result, lines: Iterable[str], *, code: int | None = None, has_findings: bool = False
     ) -> int:
-        """Print a job's verdict, if it judges, and its document or `lines`; return the exit code.
+        """Print a job's verdict, if any, and its document or `lines`; return the exit code.
 
         has_findings: `lines` contain the reasons.
         """

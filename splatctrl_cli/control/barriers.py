@@ -117,7 +117,7 @@ class SelfRows(BarrierTerm):
     kind = RowKind.SELF
 
     def __init__(self, model: RobotModel, config: ControlConfig, acceleration: Float64 | None) -> None:
-        """acceleration as for `SceneRows`."""
+        """acceleration: as for `SceneRows`."""
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)

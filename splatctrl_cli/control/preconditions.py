@@ -1,4 +1,4 @@
-"""Conditions for running a controller; violations that none can change, and obstacles that approach fixed links."""
+"""Conditions for running a controller; violations outside its control, such as approaching obstacles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Open loop along a log, and closed loop from a logged start to a goal, in the scene known then."""
+"""Open loop along a log, closed loop to a goal, in the scene known then."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -57,7 +57,7 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def terms(self) -> LogSumExp:
-        """Its terms, laid out for the kernels."""
+        """The terms, laid out for the kernels."""
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:

@@ -39,7 +39,7 @@ class CalibratedProbability:
         return self.of(sdf.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        """Its meaning and numbers, for a header."""
+        """The meaning and numbers, for a header."""
         return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 

@@ -249,7 +249,7 @@ class UnknownSpace:
         return treated
 
     def header(self) -> dict[str, object]:
-        """Its changes of a header."""
+        """The changes of a header."""
         return {
             **({"bound": BOUND} if self.policy == "obstacle" else {}),
             "unknown": self.policy,

@@ -253,7 +253,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as data URL, with size [px] and title; over: another one, to be drawn over it up to a border."""
+    """An image as data URL, with size [px] and title. over: a second one above it."""
 
     title: str
     data: str

@@ -48,7 +48,7 @@ BLOCK = 3  # cells along an edge
 
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
-    """Up to `most` of M moments, in order, with the links farthest apart.
+    """Choose `most` of M moments or fewer, in order, with the links farthest apart.
 
     Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
     """
@@ -141,8 +141,9 @@ class _View:
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
 ) -> Iterator[_View]:
-    """Yield frames, compared with the rendered robot; unexplained points within `reach` of the boxes (V, L, 2, 3)
-    stay.
+    """Yield frames, compared with the rendered robot.
+
+    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
     thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):

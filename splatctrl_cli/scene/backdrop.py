@@ -25,7 +25,7 @@ BLANK = 0.02  # share of a cell's pixels with depth
 
 
 def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], background: Color, most: int) -> Seeds:
-    """At most `most` seeds at pixels without depth that map and background leave unexplained.
+    """Place `most` seeds or fewer at pixels without depth that map and background leave unexplained.
 
     opacities: rendered (H, W). Cells of pixels become larger until the seeds are few enough.
     """

@@ -27,8 +27,9 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One command of a suite. options: by long name; matrix: values by option, each combination a variant.
+    """One command of a suite.
 
+    options: by long name. matrix: values by option; each combination is a variant.
     expect: a verdict's label or outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
     """
 

@@ -56,7 +56,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The end of a run; exit_code is None if it was killed, or never completed, for `cause`.
+    """The end of a run. exit_code: None if `cause` killed or prevented it.
 
     started [s since 1970]. stamp: of the output, changes when rewritten.
     """

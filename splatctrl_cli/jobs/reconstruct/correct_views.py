@@ -155,7 +155,7 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_reque
 
 
 def _are_exposures(gains: Float64, frames: Sequence[RgbdFrame], scale: float) -> bool:
-    """True for gains that explain half of what parts of images differ by, unlike gloss and moving shadows."""
+    """True if gains explain half of the differences of parts, unlike gloss and shadows."""
     if (gains.max(axis=0) / gains.min(axis=0)).max() <= 1 + limits.EXPOSURE_RATIO:
         return False
     bands = band_ratios(frames, scale, np.ones(len(frames), np.bool_), limits.EXPOSURE_BANDS)

@@ -169,8 +169,8 @@ class Bound:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Every step of the closed loop is solved. Rows may be relaxed over twice their margin away. A user's controller
-    always answers validly.
+    """Every step of the closed loop is solved.
+    Rows may be relaxed over twice their margin away. A user's controller always answers validly.
     """
     outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
     if outside is not None:

@@ -65,7 +65,7 @@ def select_trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[Tim
 
 
 def every_of(evidence: str | None) -> int | None:
-    """Parse k from ``--evidence k``, None for a camera. Raises UsageError if k leaves nothing to train on."""
+    """Parse k from ``--evidence k``, None for a camera. Raises UsageError for k below two."""
     try:
         every = int(evidence or "")
     except ValueError:

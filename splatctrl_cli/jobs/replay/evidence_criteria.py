@@ -118,8 +118,8 @@ PROOF = Bound(
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
-    of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
+    """Every class of evidence within the margin of the arm keeps its limit (listed below).
+    At most `--max-unknown` of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     first = BY_FEW.get(len(judged.inputs.scene.cameras or ()), LIMITS[0])
     for limit in (first, *LIMITS[1:]):
@@ -151,7 +151,7 @@ UNKNOWN_SHARE = Bound(
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
-    """The surface clearance less the bound on the map's error is at least 0; judged with `--evidence`.
+    """The surface clearance is at least the bound on the map's error; judged with `--evidence`.
 
     With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
     criterion fails. The same holds for too little evidence.
@@ -196,8 +196,8 @@ def bound_words(bound: ConformalBound) -> str:
 
 
 def belonging(judged: Judged) -> Iterator[Reason]:
-    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
-    written; splats that agree with their occupancy grid.
+    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links.
+    Files are as written, and splats agree with their occupancy grid.
     """
     yield from judged.inputs.mismatches
 
@@ -254,8 +254,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """Voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
-    the margin: an obstacle touching the robot may go unseen that far.
+    """Voxels are at most 25 mm, the size of an obstacle without a splat.
+    The robot's mask reaches at most the margin: an obstacle touching the robot may go unseen that far.
     """
     yield from VOXEL(judged)
     yield from BLIND(judged)

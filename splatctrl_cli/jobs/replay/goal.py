@@ -262,7 +262,7 @@ def commander_of(
 
 
 def _connector(request: ReplayRequest, inputs: ReplayInputs) -> tuple[str, Connect]:
-    """Name of the user's controller, and what starts it. Raises InputError for a log without commands."""
+    """Name and factory of the user's controller. Raises InputError for a log without commands."""
     limit, source, states = request.controller_step_limit, inputs.source, inputs.states
     if request.controller == RECORDED:
         commands = require(

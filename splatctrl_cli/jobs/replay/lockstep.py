@@ -159,7 +159,7 @@ class Lockstep:
         self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
 
     def scene(self) -> KnownScene:
-        """Return the scene of a replay; takes frame sets up to the first map at once."""
+        """Return the scene of a replay; take frame sets up to the first map now."""
         while self._next is not None and not self._stamps_ns:
             self._take()
         self._fitted.check_found()

@@ -151,7 +151,8 @@ def _locate(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one without joints, such as a table.
+    """No two links overlap.
+    No moving link comes within the margin of a fixed one without joints, such as a table.
     Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
     the recording was. By collision surfaces, or by spheres if these cannot be read.
     """
@@ -222,8 +223,8 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within a fixed link's margin in two scenes in a row. New is 1 cm or more
-    (at its mount 3 cm) from all that stood there, in space that was free before; the old is a note.
+    """No new obstacle comes within a fixed link's margin in two scenes in a row.
+    New is 1 cm or more (at its mount 3 cm) from all that stood there, in space that was free; the old is a note.
     """
     broken = {
         name: (first, least)
@@ -280,7 +281,9 @@ def acceleration_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
-    """The spheres' clearance less what they leave uncovered keeps the margin; every moving link has a sphere."""
+    """The spheres' clearance, less the depth of surface outside them, keeps the margin.
+    Every moving link has a sphere.
+    """
     model = judged.replay.model
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
@@ -314,7 +317,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
+    """A lower bound (by the spheres' lever arms) keeps the margin; intervals that break it are halved."""
     model, trace = judged.replay.model, judged.replay.trace
     _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
@@ -334,8 +337,9 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 
 
 def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
-    """Least clearance [m] of spheres, surface, and between states. The last two are None if unknown, or if the
-    spheres, then NaN, break the margin.
+    """Least clearance [m] of spheres, surface, and between states.
+
+    The last two are None if unknown, or if the spheres, then NaN, break the margin.
     """
     trace, field = judged.replay.trace, "certified" if "certified" in judged.replay.fields else "exact"
     spheres = lowest(trace[f"clearance_{field}"])  # as `surface` is

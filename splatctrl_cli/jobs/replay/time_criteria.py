@@ -13,8 +13,8 @@ from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Jud
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """Depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
-    without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
+    """Depth about the arm is at most `--max-map-age` old and not newer than the state.
+    After half a second without any, the next depth shows nothing where the arm was. A baked field has no times.
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
@@ -90,8 +90,9 @@ MAP_AGE = Bound(
 
 
 def map_age(judged: Judged) -> Iterator[Reason]:
-    """The map is at most `--max-map-age` old (a baked field: from its moment). Newer depth shows nothing within the
-    margin: of a state's own time that a late map (`--latency`) did not contain, or the next after the last state.
+    """The map is at most `--max-map-age` old (a baked field: from its moment).
+    Newer depth shows nothing within the margin. This depth is of a state's own time, missing in a late map
+    (`--latency`), or the next after the last state.
     """
     yield from _overtaken(judged)
     has_clock = judged.inputs.source.has_clock
@@ -133,8 +134,8 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap over `verdict.longest_interval` in which the arm could reach the margin within its velocity
-    limits. No state without a distance or dropped for its stamp (*judged states*). At most `verdict.lead_in` before
+    """No gap over `verdict.longest_interval` lets the arm reach the margin within its velocity limits.
+    No state lacks a distance or was dropped for its stamp (*judged states*). At most `verdict.lead_in` is before
     the first map.
     """
     config, replay = judged.request.config.verdict, judged.replay

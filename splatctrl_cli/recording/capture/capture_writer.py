@@ -110,7 +110,7 @@ def write_capture(
     progress: Callable[[int], None] | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], int]:
-    """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
+    """Write all of `source` into `folder`, empty or of an interrupted run.
 
     JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
     or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's

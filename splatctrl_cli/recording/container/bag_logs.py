@@ -34,7 +34,10 @@ Fields = Mapping[str, bytes]
 
 
 class Bag1Log(RawLog):
-    """One ROS 1 bag; its index is not needed: a cut or growing bag has none. Raises InputError without any record."""
+    """One ROS 1 bag, also without its index, which a truncated or growing bag lacks.
+
+    Raises InputError without any record.
+    """
 
     container = "ROS 1 bag"
 
@@ -113,7 +116,7 @@ class Bag1Log(RawLog):
         self.channels[number(fields, "conn")] = add_ros_type(topic)
 
     def records(self, damage: Damage) -> Iterator[Part]:
-        """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
+        """Yield records in order. Only chunks, connections and messages have content; losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")

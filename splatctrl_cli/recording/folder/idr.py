@@ -1,4 +1,4 @@
-"""DTU scans in the layout of IDR and NeuS, and scans of any layout as training and held-out records.
+"""DTU scans in the layout of IDR and NeuS; scans as training and held-out records.
 
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
 and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the I-th

@@ -329,9 +329,9 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
-    """A lens's corrections: none for a pinhole, whose mask is `valid`. Raises InputError for an impossible lens.
+    """A lens's corrections: none for a pinhole, whose mask is `valid`.
 
-    It keeps focal lengths; an equidistant lens's are shortened, up to `WIDEST_RAY`.
+    Raises InputError for an impossible lens. Focal lengths stay; an equidistant lens's shrink, up to `WIDEST_RAY`.
     """
     if not is_distorted(model, coefficients):
         return Lens(intrinsics=lens, valid=valid)
