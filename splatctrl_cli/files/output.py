@@ -86,7 +86,7 @@ def lock_output(partial: Path, *, is_folder: bool) -> Iterator[None]:
     The lock follows a rename, and ends with the process. Without flock(2) nothing is locked. Raises UsageError if
     another run has the lock.
     """
-    descriptor = _taken(partial, is_folder=is_folder)
+    descriptor = _acquire(partial, is_folder=is_folder)
     try:
         yield
     finally:
@@ -100,7 +100,7 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _taken(partial: Path, *, is_folder: bool) -> int:
+def _acquire(partial: Path, *, is_folder: bool) -> int:
     while True:
         if partial.is_symlink():
             partial.unlink(missing_ok=True)

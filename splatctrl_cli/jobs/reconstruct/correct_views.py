@@ -66,22 +66,22 @@ class Corrections:
         depth = require(
             depth, f"{source.name}: {self.options}: no view has depth, which alone says what views have in common"
         )
-        scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
+        scale, report = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
         if self.poses:
             moved, poses = _correct_poses(moved, scale, has_robot, console)
-            told |= poses
+            report |= poses
             rows = [
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
                 for row, f in zip(rows, moved, strict=True)
             ]
         gains = _gains(moved, scale, console, is_requested=self.exposure)
         if gains is not None:
-            told["exposure_spread"] = float(np.abs(np.log(gains)).max())
+            report["exposure_spread"] = float(np.abs(np.log(gains)).max())
             rows = [row | {"gain": gain.tolist()} for row, gain in zip(rows, gains, strict=True)]
             moved = [exposed(frame, gain) for frame, gain in zip(moved, gains, strict=True)]
-        return moved, told | {"corrected_views": rows} if told else {}
+        return moved, report | {"corrected_views": rows} if report else {}
 
 
 def _correct_poses(

@@ -107,7 +107,7 @@ class Reconstruction:
         self.writer = SceneWriter(
             folder, {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}, checkpoint
         )
-        self._kept = KeptMaps(self.writer, self.config)
+        self._maps = KeptMaps(self.writer, self.config)
         self._fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
@@ -220,7 +220,7 @@ class Reconstruction:
                 f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
                 f" slot; --max-splats {budget + row.unmet} would hold them"
             )
-        if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
+        if self.source.has_clock and (self._maps.is_due(index, step.stamp_ns) or self._maps.shows_news(self.fitter)):
             self.snapshot(step.stamp_ns)
         return row
 

@@ -77,8 +77,8 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
 
 
 def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
-    if held := metrics.get("poses", {}).get("held", []):
-        shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
+    if stayed := metrics.get("poses", {}).get("held", []):
+        shown = ", ".join(stayed[:3]) + (f" and {len(stayed) - 3} more" if len(stayed) > 3 else "")
         yield note(criterion="poses", sentence=f"not put right, too far off or seen by no other view: {shown}")
     for camera, bend in metrics.get("depth_bends", {}).items():
         yield note(
@@ -179,11 +179,11 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
     cameras = made.metrics["displaced_cameras"]
     yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
-    told = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
-    if not told:
+    medians = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
+    if not medians:
         return
-    link = max(told, key=lambda name: abs(told[name]))
-    median, allowed = told[link], 1e3 * made.config.occupancy.self_mask_tolerance
+    link = max(medians, key=lambda name: abs(medians[name]))
+    median, allowed = medians[link], 1e3 * made.config.occupancy.self_mask_tolerance
     is_off = abs(median) > allowed
     side = "behind" if median > 0 else "before"
     yield Reason(

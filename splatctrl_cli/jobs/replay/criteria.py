@@ -82,7 +82,7 @@ class Bound:
 
     on: a column (T,) of the trace, of (T, K) the least of `parts`; or a function of the worst value. who: column of
     names. at_most, at_least: the allowed value, or where the input has it, and its `tolerance`. above: to be exceeded
-    (0: the margin). say, kept: sentences, without `kept` no passed reason. quantity, why: for the documentation.
+    (0: the margin). say, passed: sentences, without `passed` no passed reason. quantity, why: for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]
@@ -94,7 +94,7 @@ class Bound:
     tolerance: Number = 0.0
     unit: str = ""
     say: str
-    kept: str = ""
+    passed: str = ""
     remedy: str = ""
     outcome: Outcome = Outcome.NOT_EVALUABLE
     label: str = ""
@@ -125,8 +125,8 @@ class Bound:
                 remedy=self.remedy,
                 label=self.label,
             )
-        elif self.kept:
-            yield passed_reason(self.kept.format(**words), value, allowed, self.unit, found.count or 0)
+        elif self.passed:
+            yield passed_reason(self.passed.format(**words), value, allowed, self.unit, found.count or 0)
 
     def breaks(self, values: Any, allowed: float, tolerance: float = 0.0) -> Any:
         """True for values that are not allowed."""

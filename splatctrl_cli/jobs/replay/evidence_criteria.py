@@ -33,7 +33,7 @@ LIMITS = (
         on="unseen",
         at_most=UNSEEN,
         say="{percent:.0f} % of the space within the margin of the arm was never seen, allowed {allowed_percent:g} %",
-        kept="{percent:.0f} % of the space within the margin of the arm was never seen",
+        passed="{percent:.0f} % of the space within the margin of the arm was never seen",
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
@@ -145,7 +145,7 @@ UNKNOWN_SHARE = Bound(
     on=_unknown_share,
     at_most=attrgetter("request.max_unknown"),
     say="{percent:.1f} % of the sphere centres lie in unseen space, allowed {allowed_percent:g} %, first",
-    kept="{percent:.2g} % of sphere centres in unseen space",
+    passed="{percent:.2g} % of sphere centres in unseen space",
     remedy="add a camera, or give a larger --max-unknown",
 )
 
@@ -297,7 +297,7 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="clocks",
         find=CLOCKS,
-        asked="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
+        meaning="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
         broken=UNKNOWN,
     ),
 )

@@ -56,8 +56,8 @@ POSE_COLUMNS = tuple(POSE.split(","))
 
 def check_goal(request: ReplayRequest) -> None:
     """Raise UsageError for an option the mode does not use."""
-    asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
-    modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)}
+    controlled, driven = ("open-loop", "closed-loop"), ("closed-loop",)
+    modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), controlled)}
     for option, wanted in modes.items():
         given = getattr(request, option)
         if given is not None and given is not False and request.mode not in wanted:

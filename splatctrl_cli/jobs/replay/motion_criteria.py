@@ -252,7 +252,7 @@ POSITION = over_limit(
     tolerance=attrgetter("request.config.control.limit_tolerance"),
     unit="rad",
     say="{who} is {negated:.4f} rad or m outside its limits",
-    kept="at least {value:.3f} rad inside",
+    passed="at least {value:.3f} rad inside",
     remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
 )
 VELOCITY, ACCELERATION = (
@@ -262,7 +262,7 @@ VELOCITY, ACCELERATION = (
         at_most=1.0,
         tolerance=LIMIT_EXCEEDED - 1.0,
         say="{who} reaches {value:.2f} times its limit",
-        kept="at most {value:.2f} of the limit",
+        passed="at most {value:.2f} of the limit",
         remedy="check the stamps and units of the states, and the URDF's limits",
     )
     for name in ("velocity", "acceleration")
@@ -369,7 +369,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="position limits",
         find=POSITION,
-        asked="joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise",
+        meaning="joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise",
         broken=BROKEN,
     ),
     Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),

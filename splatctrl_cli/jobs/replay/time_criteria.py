@@ -46,7 +46,7 @@ EVIDENCE_AGE = Bound(
     at_most=OLDEST,
     unit="s",
     say="the newest depth near the arm is {value:.2f} s old, allowed {allowed:g} s",
-    kept="depth from about the arm at most {value:.2f} s before",
+    passed="depth from about the arm at most {value:.2f} s before",
     remedy="frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
 )
 
@@ -84,7 +84,7 @@ MAP_AGE = Bound(
     at_most=OLDEST,
     unit="s",
     say="the map is up to {value:.2f} s old, allowed {allowed:g} s, {words}",
-    kept="at most {value:.2f} s",
+    passed="at most {value:.2f} s",
     remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
 )
 
@@ -203,6 +203,6 @@ CLOCKS = Bound(
     tolerance=attrgetter("logged.clock.uncertainty_s"),
     unit="s",
     say="the cameras' clock is {ms:.0f} ms {words}",
-    kept="{ms:.0f} ms apart",
+    passed="{ms:.0f} ms apart",
     remedy="synchronise the clocks, or shift one in the log",
 )

@@ -98,7 +98,7 @@ def _figures(report: CoverageReport) -> dict[str, Any]:
             "uncovered_share": link.uncovered_share,
             "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
             "deficit": None if link.deficit is None else max(0.0, link.deficit.proven),
-            "deficit_found": None if link.deficit is None else max(0.0, link.deficit.found),
+            "deficit_found": None if link.deficit is None else max(0.0, link.deficit.lower),
             "place": None if link.deficit is None else link.deficit.place.tolist(),
             "protrusion": link.protrusion,
             "worst_sphere": link.worst_sphere,

@@ -58,10 +58,10 @@ class Journal:
             self.path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
         with self.path.open("r+b") as stream:  # a killed run may leave half a line
             stream.truncate(sum(len(line) for line in stream if line.endswith(b"\n")))
-        self._kept = self.entries()
+        self._earlier = self.entries()
 
     def next_kept(self) -> Entry | None:
-        entry = next(self._kept, None)
+        entry = next(self._earlier, None)
         self.num_entries += entry is not None
         return entry
 

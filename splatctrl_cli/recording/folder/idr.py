@@ -248,8 +248,8 @@ class DtuSource:
             self.split = protocol.split(numbers, f"{root}/{dtu_scan.name}")
         else:
             self.split = _held_out(numbers, frozenset(holdout), root)
-        self._held = set(self.split.scored) - set(self.split.training)
-        self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
+        self._held_out = set(self.split.scored) - set(self.split.training)
+        self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held_out else (TRAINING_CAMERA,)
         is_left_out = self.layout == "MVSNet"
         notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in dtu_scan.without_depth]
         self.loss = LossReport(unpaired_color=len(notes), notes=notes)
@@ -283,7 +283,7 @@ class DtuSource:
                 continue
             yield RgbdFrame(
                 stamp_ns=number,
-                camera=HOLDOUT_CAMERA if number in self._held else TRAINING_CAMERA,
+                camera=HOLDOUT_CAMERA if number in self._held_out else TRAINING_CAMERA,
                 color=view.color,
                 depth=view.depth,
                 intrinsics=view.intrinsics,

@@ -90,7 +90,7 @@ def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(
     record = ReplayRecord(model, scene, config=Config(), max_map_age=9.0, is_continuous=False)
     for second in range(4):
         record.measure_block(np.array([second * SECOND]), q[None], np.zeros((1, 7)))
-    first, least = record.fixed_parts.found["link0[0]"]
+    first, least = record.fixed_parts.clearances["link0[0]"]
     assert first > 0.1
     assert least == (pytest.approx(-0.01, abs=0.03) if has_come else first)
 
