@@ -93,8 +93,8 @@ def bends_alone() -> Float64:
 class BentViews:
     """Views, and the bends (C, G) of their cameras to solve for.
 
-    cameras (N,): number of each view's camera, `HELD` where its depth stays as it is. now: the views without current
-    bends.
+    cameras (N,): number of each view's camera, or `HELD` where depth stays as recorded. now: the views with the
+    current bends removed.
     """
 
     recorded: Sequence[GrayView]

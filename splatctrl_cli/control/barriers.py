@@ -47,9 +47,9 @@ class SceneRows(BarrierTerm):
         return other
 
     def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """Distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
+        """Distances (M,) [m], for `chosen` (M,) spheres raised to their link's surface gap.
 
-        Where that gap is larger, rows G (M, J) become its rows, in place.
+        Rows G (M, J) of raised spheres are replaced by the gap's, in place.
         """
         if self._balls is None or not chosen.any():
             return distance

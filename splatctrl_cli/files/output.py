@@ -65,7 +65,7 @@ class Parts:
             return path
         listed, what = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
         digest = require(listed, what, remedy=self.remedy)
-        refuse_if(not path.is_file(), f"{path}: missing; it was listed", remedy=self.remedy)
+        refuse_if(not path.is_file(), f"{path}: missing, though its run wrote it", remedy=self.remedy)
         refuse_if(
             sha256(path) != digest, f"{path}: was changed after it was written (another sha256)", remedy=self.remedy
         )

@@ -50,7 +50,8 @@ BLOCK = 3  # cells along an edge
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
     """Choose `most` of M moments or fewer, in order, with the links farthest apart.
 
-    Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
+    Farthest-point sampling by the distance between postures, plus a share of the path between them.
+    T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _move(T_world_link, corners).reshape(len(T_world_link), -1, 3)

@@ -63,9 +63,7 @@ class Corrections:
         depth = RecordedDepth.of(frames)
         if not self and (source.has_clock or has_robot or depth is None):
             return list(frames), {}
-        depth = require(
-            depth, f"{source.name}: {self.options}: no view has depth, which alone says what views have in common"
-        )
+        depth = require(depth, f"{source.name}: {self.options}: expected views with depth, got none")
         scale, report = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
@@ -102,7 +100,7 @@ def _correct_poses(
         )
     else:
         console.log(
-            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no move betters it"
+            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no correction reduces it"
         )
     return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
         "pose_residual": found.after,
@@ -135,7 +133,7 @@ def _describe(bends: FoundBends, scale: float, apart: float, after: float, conso
             f" {depth:.2f} m: surfaces of two views are {1e3 * after:.2f} mm apart, {1e3 * apart:.2f} by poses alone"
         )
     if not rows and (bends.gains or bends.unlike):
-        console.log("depth: stays as recorded: no bend that one half of the views tells holds for the other")
+        console.log("depth: stays as recorded: the two halves of the views show different bends")
     return {"depth_bend": max((row["largest"] for row in rows.values()), default=0.0)} | (
         {"depth_bends": rows} if rows else {}
     )

@@ -45,7 +45,7 @@ class RecordingRequest:
     def __post_init__(self) -> None:
         refuse_if(
             self.others and is_folder_of_views(self.path),
-            f"--reference {self.path}: expected a log beside others, got images in a folder",
+            f"--reference {self.path}: expected a log, as the others are, got a folder of images",
             error=UsageError,
         )
 
@@ -108,8 +108,8 @@ def open_held_out(
     )
     refuse_if(
         recording.options.holdout,
-        "--holdout: the protocol says what is held out",
-        remedy="leave one of them out",
+        "--holdout: the protocol holds views out already",
+        remedy="give --holdout or --protocol, not both",
         error=UsageError,
     )
     options = replace(recording.options, cameras=None)

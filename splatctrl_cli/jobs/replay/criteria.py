@@ -170,7 +170,7 @@ class Bound:
 
 def controller(judged: Judged) -> Iterator[Reason]:
     """Every step of the closed loop is solved.
-    Rows may be relaxed over twice their margin away. A user's controller always answers validly.
+    Rows may be relaxed only at over twice their margin. A user's controller always answers validly.
     """
     outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
     if outside is not None:
@@ -200,7 +200,7 @@ def controller(judged: Judged) -> Iterator[Reason]:
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
     found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(
-        sentence=f"its rows could not be satisfied at {found} of {len(trace.steps)} steps, first",
+        sentence=f"constraints could not be satisfied at {found} of {len(trace.steps)} steps, first",
         value=float(sum(bad.values())),
         threshold=0.0,
         time_s=first.start_s,
@@ -215,7 +215,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
     """No obstacle appears inside the arm's surface; judged in closed loop."""
     if hits := [change for change in judged.replay.scene_changes if change.is_hit]:
         yield failed(
-            sentence=f"obstacles appeared inside the arm {len(hits)} times, first",
+            sentence=f"{plural(len(hits), 'obstacle')} appeared inside the arm, first",
             value=float(len(hits)),
             threshold=0.0,
             time_s=float(hits[0].stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,

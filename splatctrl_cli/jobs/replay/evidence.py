@@ -72,8 +72,8 @@ def every_of(evidence: str | None) -> int | None:
         return None
     if every < 2:
         raise UsageError(
-            f"--evidence {evidence}: expected a camera or every how many frame sets, at least 2",
-            remedy="every 4th, say, is left out of the training with --evidence 4",
+            f"--evidence {evidence}: expected a camera, or a number of frame sets from 2",
+            remedy="--evidence 4 leaves every 4th frame set out of the training",
         )
     return every
 

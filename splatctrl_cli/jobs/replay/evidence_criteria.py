@@ -47,13 +47,13 @@ LIMITS = (
         remedy="add a camera that sees that side",
     ),
     Bound(
-        quantity="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        quantity="from a surface of the map to a sphere of the arm, nine tenths of the points about it never seen",
         why="space that is almost entirely unseen may hold a whole object",
         on="blind_to_surface",
         unit="m",
         above=BEYOND,
-        say="a part of the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed "
-        "{allowed_mm}: the surface may extend there",
+        say="the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed {allowed_mm}: "
+        "the surface may extend there",
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
@@ -62,7 +62,7 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.UNANSWERED,),
-        say="cameras got no depth from a place {mm} from the arm, margin {allowed_mm}",
+        say="no camera measured depth at a place {mm} from the arm, margin {allowed_mm}",
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
     Bound(
@@ -71,8 +71,8 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.CONTRADICTED,),
-        say="{mm} from the arm, margin {allowed_mm}, one camera measures depth behind a surface that another one "
-        "sees",
+        say="one camera measures depth behind a surface that another one sees, {mm} from the arm, margin "
+        "{allowed_mm}",
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
     Bound(
@@ -81,8 +81,9 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.DEPTH_EDGE,),
-        say="a depth edge was lost {mm} from the arm, margin {allowed_mm}: the surface may extend one pixel further",
-        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+        say="an edge without depth is {mm} from the arm, margin {allowed_mm}: the surface may extend one pixel "
+        "further",
+        remedy="keep farther from the edge, or add a camera that sees past it or has smaller pixels",
     ),
     Bound(
         quantity="outside of the workspace, from the arm",
@@ -126,11 +127,17 @@ def known_space(judged: Judged) -> Iterator[Reason]:
         yield from limit(judged)
     if (is_occupied := judged.request.unseen == OCCUPIED) or judged.request.require_proof:
         if np.isnan(judged.replay.trace["assumed"]).all():
-            yield lacking(sentence="evidence of the space near the arm is not recorded")
+            yield lacking(
+                sentence="expected evidence of the space near the arm, got none",
+                remedy="give a reconstruction as --scene",
+            )
         proof = replace(PROOF, outcome=Outcome.FAILED, label=MARGIN) if is_occupied else PROOF
         yield from proof(judged)
     if judged.metrics["unknown_share"] is None:
-        yield lacking(sentence="the space that cameras saw is not recorded")
+        yield lacking(
+            sentence="expected a record of the space that cameras saw, got none",
+            remedy="give a reconstruction as --scene, or bake with the channel observed",
+        )
     yield from UNKNOWN_SHARE(judged)
 
 
@@ -161,10 +168,10 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
     if found is not None and found.bound is None:
         yield lacking(
-            sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
-            "surface near the motion, too few for two independent stretches",
+            sentence=f"not bounded: {found.num_seen} of {found.num_sets} held-out frame sets show surface near the "
+            "motion, too few for two independent stretches",
             who=found.source,
-            remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
+            remedy="judge a longer motion, name another camera, or raise verdict.evidence_reach",
             count=found.num_seen,
         )
     if found is None or found.bound is None or surface is None:  # no distance at any state: others report it
@@ -174,8 +181,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield passed_reason(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
     yield lacking(
-        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), but the motion keeps only "
-        f"{mm(surface)}; it missed most",
+        sentence=f"{bound_words(found.bound)}, but the clearance is only {mm(surface)}; largest miss",
         value=surface - value,
         threshold=0.0,
         unit="m",
@@ -183,14 +189,14 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         place=found.place,
         who=found.source,
         cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
-        remedy="a map that misses less needs more cameras, newer frames or a larger --max-splats",
+        remedy="for a smaller error, add cameras, or raise frame rate or --max-splats",
         count=found.num_points,
     )
 
 
 def bound_words(bound: ConformalBound) -> str:
     return (
-        f"map error at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
+        f"at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
         f"{bound.num_stretches} stretches of held-out depth"
     )
 
@@ -214,7 +220,7 @@ def find_displaced(judged: Judged) -> tuple[str, float] | None:
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, all cameras each link, within 5 mm of the joints."""
+    """Each camera sees the robot, and all cameras each link, within 5 mm of joints."""
     figures = judged.inputs.scene.figures()
     if (camera := find_displaced(judged)) is not None:
         yield lacking(
@@ -255,7 +261,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
     """Voxels are at most 25 mm, the size of an obstacle without a splat.
-    The robot's mask reaches at most the margin: an obstacle touching the robot may go unseen that far.
+    The robot's mask reaches at most the margin, as it may hide an obstacle that touches the robot.
     """
     yield from VOXEL(judged)
     yield from BLIND(judged)
@@ -273,7 +279,7 @@ VOXEL = Bound(
     on=lambda judged: lacking(sentence="", value=judged.inputs.scene.figures().get("voxel")),
     at_most=COARSE_VOXEL,
     unit="m",
-    say="the map has voxels of {mm}, allowed {allowed_mm} beside a robot",
+    say="the map has voxels of {mm}, allowed {allowed_mm} near a robot",
     remedy="reconstruct with --urdf, or with --set scene.scale=1",
 )
 BLIND = Bound(

@@ -148,7 +148,7 @@ def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists without a controller, or a frame without twists."""
     if request.twist_topic is not None and request.mode == "audit":
         raise UsageError(
-            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit does not ask the controller"
+            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit uses no controller"
         )
     if request.twist_frame is not None and request.twist_topic is None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
@@ -228,7 +228,7 @@ def check_controller(request: ReplayRequest) -> None:
     if request.mode == "audit":
         raise UsageError(
             "--controller, --controller-command: expected --mode open-loop or closed-loop",
-            remedy="an audit does not ask a controller",
+            remedy="an audit uses no controller",
         )
     if is_policy_server(request.controller or ""):
         parse_address(request.controller or "")

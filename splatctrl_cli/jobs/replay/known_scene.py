@@ -121,9 +121,7 @@ def fields_at(
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(stamps_ns, stamp_ns - latency_ns) - 1
         if index < 0:
-            raise NotEvaluableError(
-                f"no scene is known at stamp {stamp_ns} ns", remedy="it was not seen yet; ask for a later time"
-            )
+            raise NotEvaluableError(f"no map is known yet at stamp {stamp_ns} ns", remedy="give a later time")
         return kept(key_of(index))
 
     return at

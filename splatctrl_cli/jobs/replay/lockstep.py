@@ -51,7 +51,7 @@ def check_lockstep(request: ReplayRequest) -> None:
     if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
     if not request.lockstep and request.device.startswith(CUDA):
-        raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
+        raise UsageError(f"--device {request.device}: expected --lockstep, as only a fit uses a GPU", remedy=TO_CPU)
 
 
 def choose_scene(

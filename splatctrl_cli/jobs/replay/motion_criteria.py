@@ -50,7 +50,8 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
     room, loss = exact - judged.threshold, exact - least
     voxel = judged.metrics.get("voxel") or 0.02
     yield lacking(
-        sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}",
+        sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}, "
+        f"margin {mm(judged.replay.margin)}",
         value=least,
         threshold=judged.replay.margin,
         unit="m",
@@ -86,8 +87,8 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     worst = min(events, key=lambda event: event.worst)
     if represented is not None:
         starved = lacking(
-            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
-            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            sentence=f"{worst.worst_name} is {mm(least)} from occupied space without a splat, margin "
+            f"{mm(replay.margin)} (the nearest splat is {mm(represented)} away),",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -101,8 +102,8 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     link, why = unlearned_link(judged) or ("", "")
     if link and worst.worst_name.startswith(f"{link}["):
         part = lacking(
-            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is within it from the "
-            f"first state on and may be a part of {link}, which {why},",
+            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is there from the first "
+            f"state on and may be a part of {link}, which {why},",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -153,8 +154,8 @@ def _locate(event: Event, reason: Reason) -> Reason:
 def self_clearance(judged: Judged) -> Iterator[Reason]:
     """No two links overlap.
     No moving link comes within the margin of a fixed one without joints, such as a table.
-    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
-    the recording was. By collision surfaces, or by spheres if these cannot be read.
+    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap), or than
+    recorded. The gaps are those of collision surfaces, or of spheres if these cannot be read.
     """
     trace = judged.replay.trace
     found = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
@@ -166,7 +167,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
             sentence=f"{found.who} overlap by {mm(-least)}",
             threshold=0.0,
             unit="m",
-            remedy="pairs that may touch are named by --srdf",
+            remedy="name pairs that may touch with --srdf",
             label=CONTACT,
         )
     elif np.isfinite(least):
@@ -190,7 +191,7 @@ def _check_fixture(judged: Judged) -> Reason | None:
         unit="m",
         who=" and ".join(pair.links),
         time_s=float(stamp - int(judged.replay.trace.stamp_ns[0])) * 1e-9,
-        remedy="pairs that may touch are named by --srdf",
+        remedy="name pairs that may touch with --srdf",
         count=judged.replay.num_states,
         label=MARGIN,
     )
@@ -224,7 +225,7 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
     """No new obstacle comes within a fixed link's margin in two scenes in a row.
-    New is 1 cm or more (at its mount 3 cm) from all that stood there, in space that was free; the old is a note.
+    New means 1 cm or more (3 cm at the mount) from earlier surfaces, in space that was free; others are a note.
     """
     broken = {
         name: (first, least)
@@ -234,7 +235,8 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])
         yield failed(
-            sentence=f"the scene is within {mm(least)} of {name}, which no joint moves ({mm(first)} at first)",
+            sentence=f"the scene is {mm(least)} from {name}, which no joint moves, margin {mm(judged.replay.margin)} "
+            f"({mm(first)} at first)",
             value=least,
             threshold=judged.replay.margin,
             unit="m",
@@ -288,7 +290,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
         yield lacking(
-            sentence=f"the share of the robot that its spheres cover is unknown: {model.coverage_unknown}",
+            sentence=f"the coverage of the robot by its spheres is unknown: {model.coverage_unknown}",
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
@@ -303,8 +305,8 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
         return
     if surface < judged.threshold:
         yield lacking(
-            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}: up to "
-            f"{mm(float(np.nanmax(deficit)))} of it lies outside them",
+            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}, margin "
+            f"{mm(judged.replay.margin)}: it lies up to {mm(float(np.nanmax(deficit)))} outside them,",
             value=surface,
             threshold=judged.replay.margin,
             unit="m",
@@ -324,9 +326,11 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
         return
     if between < judged.threshold <= surface:
         yield lacking(
-            sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene"
+            sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene, margin "
+            f"{mm(judged.replay.margin)},"
             if bool(trace["is_met"][int(np.nanargmin(trace["clearance_between"]))])
-            else f"the arm may have come within {mm(between)} between two states",
+            else f"between two states the arm may have come within {mm(between)} of the scene, margin "
+            f"{mm(judged.replay.margin)},",
             value=between,
             threshold=judged.replay.margin,
             unit="m",
@@ -352,15 +356,13 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="clearance",
         find=clearance,
-        broken=f"{BROKEN}; {UNKNOWN} where only voxels that are occupied and have no splat break it (a starved map: "
-        "raise `--max-splats`), or an object is near from the first state on and may be a part of a link that hardly "
-        "moves",
+        broken=f"{BROKEN}; {UNKNOWN} if only occupied voxels without a splat break it (raise `--max-splats`), or if "
+        "an object that is near from the first state on may be a part of a link that hardly moves",
     ),
     Criterion(
         name="certified clearance",
         find=certified_clearance,
-        broken=f"{UNKNOWN}: the grid is too coarse, and the largest voxel that would do; {BROKEN} where the "
-        "interpolated value breaks it too",
+        broken=f"{UNKNOWN}, with the largest voxel that suffices; {BROKEN} if the interpolated value breaks it too",
     ),
     Criterion(name="clearance of people", find=clearance_of_people, broken=BROKEN),
     Criterion(name="true clearance", find=true_clearance, broken=BROKEN),

@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Jud
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """Depth about the arm is at most `--max-map-age` old and not newer than the state.
+    """Depth near the arm is at most `--max-map-age` old and not newer than the state.
     After half a second without any, the next depth shows nothing where the arm was. A baked field has no times.
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
@@ -26,7 +26,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             threshold=margin,
             unit="m",
             time_s=when,
-            remedy="its time of arrival is unknown: cameras must give depth all the time",
+            remedy="its time of arrival is unknown: record depth without pauses",
             count=judged.replay.num_states,
         )
     yield from AHEAD(judged)
@@ -83,9 +83,9 @@ MAP_AGE = Bound(
     on=_oldest_map,
     at_most=OLDEST,
     unit="s",
-    say="the map is up to {value:.2f} s old, allowed {allowed:g} s, {words}",
+    say="the map is up to {value:.2f} s old, allowed {allowed:g} s ({words}),",
     passed="at most {value:.2f} s",
-    remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
+    remedy="record depth during the whole motion, or raise --max-map-age",
 )
 
 
@@ -98,7 +98,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
     has_clock = judged.inputs.source.has_clock
     if np.isnan(judged.replay.trace["map_age_s"]).all() and judged.request.field is not None and has_clock:
         yield lacking(
-            sentence="the field does not say what time it shows",
+            sentence="the baked field has no time",
             remedy="give --scene, or bake a reconstruction instead of bare splats",
             count=judged.replay.num_states,
         )
@@ -202,7 +202,7 @@ CLOCKS = Bound(
     at_most=CLOCKS_APART,
     tolerance=attrgetter("logged.clock.uncertainty_s"),
     unit="s",
-    say="the cameras' clock is {ms:.0f} ms {words}",
+    say="the cameras' clock is {ms:.0f} ms {words}, allowed {allowed:g} s",
     passed="{ms:.0f} ms apart",
     remedy="synchronise the clocks, or shift one in the log",
 )

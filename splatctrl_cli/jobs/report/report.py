@@ -103,7 +103,7 @@ def write_page_of_runs(
 ) -> None:
     """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
 
-    views: pictures of a map. In 3-D are replays, or a map alone.
+    views: pictures of a map. The page shows replays in 3-D, or a map if there are none.
     """
     scenes, sections = dict[str, str](), list[RunSection]()
     for heading, run in runs.items():

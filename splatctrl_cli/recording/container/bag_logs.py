@@ -269,7 +269,7 @@ class Db3Log(RawLog):
         except (sqlite3.Error, ValueError) as error:
             remedy = "try 'ros2 bag reindex', or copy it again"
             if header[_FILE_FORMAT] == _WAL and not has_journal:
-                error = ValueError(f"{error}, and {self._journal.name} is not beside it")
+                error = ValueError(f"{error}, and {self._journal.name} is missing")
                 remedy = f"copy {self._journal.name} from where the bag was recorded: a stopped recorder leaves it"
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 

@@ -241,8 +241,8 @@ class DtuSource:
         if protocol is not None:
             refuse_if(
                 holdout,
-                "--holdout: the protocol says what is held out",
-                remedy="leave one of them out",
+                "--holdout: the protocol holds views out already",
+                remedy="give --holdout or --protocol, not both",
                 error=UsageError,
             )
             self.split = protocol.split(numbers, f"{root}/{dtu_scan.name}")

@@ -201,7 +201,7 @@ def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
 
 def test_a_log_that_ends_with_the_motion_is_not_blamed_for_an_old_map() -> None:
     (reason,) = evidence.map_age(judged({"map_age_s": np.append(np.full(NUM - 1, 0.1), 1.01)}))
-    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s, from 1.00 to 1.00 s")
+    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s (from 1.00 to 1.00 s)")
 
 
 @pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.PASSED), (1.5, Outcome.FAILED)])

@@ -38,7 +38,7 @@ def look_free(points: Float64) -> tuple[Index, UInt8]:
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
     at = fields_at((100, 200), 50, lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
     assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
-    expect_refusal("no scene is known at stamp 149 ns", at, 149, error=NotEvaluableError)
+    expect_refusal("no map is known yet at stamp 149 ns", at, 149, error=NotEvaluableError)
 
 
 @pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])
@@ -211,6 +211,8 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
         code, verdict = stage.replayed("--field", str(field))
         assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
         words = (
-            "the space that cameras saw is not recorded" if state is None else "100 % of the space within the margin"
+            "expected a record of the space that cameras saw"
+            if state is None
+            else "100 % of the space within the margin"
         )
         assert words in verdict["sentence"]

@@ -270,7 +270,7 @@ def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
 
 
 def test_a_log_beside_an_image_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"views.toml: expected a log beside others, got images in a folder"):
+    with pytest.raises(UsageError, match=r"views.toml: expected a log, as the others are, got a folder of images"):
         RecordingRequest(path=tmp_path / "views.toml", others=(tmp_path / "b.mcap",))
 
 
