@@ -197,7 +197,7 @@ def _arm_findings(
                 note(
                     "arm",
                     where,
-                    f"the arm's depth is {1e3 * agreement.median:+.0f} mm behind its surface (median of"
+                    f"the arm's depth is {1e3 * agreement.median:+z.0f} mm behind its surface (median of"
                     f" {agreement.num_pixels} pixels in {agreement.num_frames} images);"
                     f" {100 * agreement.seen_through:.0f} % of them show the background",
                     value=round(1e3 * agreement.median, 1),
@@ -267,7 +267,7 @@ def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
     return _clock_finding(
         where,
-        f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
+        f"frames are stamped {1e3 * offset_s:+z.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
         f" by the arm's depth){rest}",
         offset_s,
         limits.TIME_OFFSET + limits.TIME_ERROR,

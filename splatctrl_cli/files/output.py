@@ -63,7 +63,7 @@ class Parts:
         """Return the path. Raises InputError if the file is not as written."""
         if self.digests is None:
             return path
-        listed, what = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
+        listed, what = self.digests.get(self._name(path)), f"{path}: expected a file that its run wrote, got none"
         digest = require(listed, what, remedy=self.remedy)
         refuse_if(not path.is_file(), f"{path}: missing, though its run wrote it", remedy=self.remedy)
         refuse_if(

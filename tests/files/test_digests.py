@@ -46,7 +46,9 @@ def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> Non
     assert json.loads((scene / "run.json").read_text())["parts"].keys() == digests.keys()
     (scene / "other.ply").write_bytes(b"x")
     expect_refusal(
-        "other.ply: not among the parts", Parts.from_folder(scene / "other.ply").checked, scene / "other.ply"
+        "other.ply: expected a file that its run wrote",
+        Parts.from_folder(scene / "other.ply").checked,
+        scene / "other.ply",
     )
     for parts in (3, {"splats.ply": 3}):
         without_parts(scene, parts=parts)

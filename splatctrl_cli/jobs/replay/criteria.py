@@ -200,7 +200,8 @@ def controller(judged: Judged) -> Iterator[Reason]:
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
     found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(
-        sentence=f"constraints could not be satisfied at {found} of {len(trace.steps)} steps, first",
+        sentence=f"constraints could not be satisfied at {sum(bad.values()):.0f} of {len(trace.steps)} steps "
+        f"({found}), first",
         value=float(sum(bad.values())),
         threshold=0.0,
         time_s=first.start_s,

@@ -42,8 +42,8 @@ LIMITS = (
         on="unseen_path",
         unit="m",
         above=UNSEEN_PATH,
-        say="a surface of the map is {mm} from the arm through unseen space, expected over {allowed_mm}: the object "
-        "may extend to the arm",
+        say="a surface of the map is {mm} from the arm through unseen space, expected over {allowed_mm} (the "
+        "object may extend to the arm)",
         remedy="add a camera that sees that side",
     ),
     Bound(
@@ -52,8 +52,8 @@ LIMITS = (
         on="blind_to_surface",
         unit="m",
         above=BEYOND,
-        say="the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed {allowed_mm}: "
-        "the surface may extend there",
+        say="the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed {allowed_mm} "
+        "(the surface may extend there)",
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
@@ -81,8 +81,8 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.DEPTH_EDGE,),
-        say="an edge without depth is {mm} from the arm, margin {allowed_mm}: the surface may extend one pixel "
-        "further",
+        say="an edge without depth is {mm} from the arm, margin {allowed_mm} (the surface may extend one pixel "
+        "further)",
         remedy="keep farther from the edge, or add a camera that sees past it or has smaller pixels",
     ),
     Bound(

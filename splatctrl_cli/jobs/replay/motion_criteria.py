@@ -88,7 +88,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     if represented is not None:
         starved = lacking(
             sentence=f"{worst.worst_name} is {mm(least)} from occupied space without a splat, margin "
-            f"{mm(replay.margin)} (the nearest splat is {mm(represented)} away),",
+            f"{mm(replay.margin)} (the nearest splat is {mm(represented)} away)",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -306,7 +306,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
     if surface < judged.threshold:
         yield lacking(
             sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}, margin "
-            f"{mm(judged.replay.margin)}: it lies up to {mm(float(np.nanmax(deficit)))} outside them,",
+            f"{mm(judged.replay.margin)} (up to {mm(float(np.nanmax(deficit)))} of it lies outside them)",
             value=surface,
             threshold=judged.replay.margin,
             unit="m",
@@ -327,10 +327,10 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     if between < judged.threshold <= surface:
         yield lacking(
             sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene, margin "
-            f"{mm(judged.replay.margin)},"
+            f"{mm(judged.replay.margin)}"
             if bool(trace["is_met"][int(np.nanargmin(trace["clearance_between"]))])
             else f"between two states the arm may have come within {mm(between)} of the scene, margin "
-            f"{mm(judged.replay.margin)},",
+            f"{mm(judged.replay.margin)}",
             value=between,
             threshold=judged.replay.margin,
             unit="m",

@@ -83,7 +83,7 @@ MAP_AGE = Bound(
     on=_oldest_map,
     at_most=OLDEST,
     unit="s",
-    say="the map is up to {value:.2f} s old, allowed {allowed:g} s ({words}),",
+    say="the map is up to {value:.2f} s old, allowed {allowed:g} s ({words})",
     passed="at most {value:.2f} s",
     remedy="record depth during the whole motion, or raise --max-map-age",
 )

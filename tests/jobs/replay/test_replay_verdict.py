@@ -338,7 +338,7 @@ def test_a_controller_that_cannot_keep_its_rows_fails_alone(stage: Stage, monkey
     goal = "--goal-joints=" + ",".join(str(v) for v in START)
     code, verdict = stage.judged("--set", "control.self_margin=0.06", goal, mode="closed-loop")
     assert (code, verdict["label"], decisive(verdict)) == (1, "controller failed", {"controller": "failed"})
-    assert "constraints could not be satisfied at 1 relaxed of 1 steps" in verdict["sentence"]
+    assert "constraints could not be satisfied at 1 of 1 steps (1 relaxed)" in verdict["sentence"]
 
 
 def test_a_goal_that_is_not_reached_fails_alone(stage: Stage) -> None:
