@@ -155,7 +155,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     """No two links overlap.
     No moving link comes within the margin of a fixed one without joints, such as a table.
     Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap), or than
-    recorded. The gaps are those of collision surfaces, or of spheres if these cannot be read.
+    recorded. Gaps are of collision surfaces, or of spheres if these cannot be read.
     """
     trace = judged.replay.trace
     found = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
@@ -357,7 +357,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
         name="clearance",
         find=clearance,
         broken=f"{BROKEN}; {UNKNOWN} if only occupied voxels without a splat break it (raise `--max-splats`), or if "
-        "an object that is near from the first state on may be a part of a link that hardly moves",
+        "an object near from the first state on may be part of a link that hardly moves",
     ),
     Criterion(
         name="certified clearance",
