@@ -291,8 +291,8 @@ def people_of(closed: ReplayResult, human: Sequence[str]) -> DistanceToPeople:
                 remedy="name one with --human",
             )
         return lambda points, stamp_ns: distance_to(chosen, points, stamp_ns)
-    stamps = scene.stamps_ns or (int(closed.inputs.states.stamp_ns[0]),)
-    if all(scene.at(stamp + scene.latency_ns).human is None for stamp in stamps):
+    stamps = scene.known_ns or (int(closed.inputs.states.stamp_ns[0]),)
+    if all(scene.at(stamp).human is None for stamp in stamps):
         raise NotEvaluableError(
             "baselines: expected splats labelled human, got none at any time",
             remedy="reconstruct from a log with masks of people, or give --truth and --human",

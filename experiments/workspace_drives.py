@@ -126,12 +126,13 @@ class LiveMap:
         stamps = tuple(self._stamps)
         voxels = {"voxel": self._config.occupancy.voxel}
         return KnownScene(
-            at=fields_at(stamps, 0, lambda index: index, lambda index: self._fields[index]),
+            at=fields_at(stamps, lambda index: index, lambda index: self._fields[index]),
             observed=known_space(self._fitter.known_voxels().grid),
             seen_at=lambda stamp: seen_of(self._seen[int(np.searchsorted(stamps, stamp, side="right")) - 1]),
             figures=lambda: voxels | self_mask_metrics(self._rows),
             first_ns=stamps[0],
             stamps_ns=stamps,
+            known_ns=stamps,
             cameras=None,
             digests={},
         )

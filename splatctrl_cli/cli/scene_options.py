@@ -399,6 +399,7 @@ REPLAY = (  # what people use, and in groups the rest
             real(0, MAX_SECONDS, "s"),
             0.0,
         ),
+        option("--real-time", "a map is known when this machine has computed it (--lockstep)"),
         option("--require-evidence", "not evaluable (exit 5) without a bound on the map's error"),
         option(
             "--unseen",

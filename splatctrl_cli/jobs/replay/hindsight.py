@@ -45,7 +45,7 @@ class NewerDepth:
         is_clear = clearance >= self._margin
         states = [(int(stamps[k]), positions[k].copy()) for k in np.flatnonzero(is_clear)]
         self._last = states[-1] if is_clear[-1] else None
-        if self._scene.latency_ns:
+        if self._scene.own_ns(int(stamps[-1])) != stamps[-1]:
             self._waiting += states
             self._hold(int(stamps[-1]))
 
@@ -54,7 +54,7 @@ class NewerDepth:
         if self._last is None or not self._scene.stamps_ns:
             return
         stamp_ns, q = self._last
-        own_ns = stamp_ns + self._scene.latency_ns
+        own_ns = self._scene.own_ns(stamp_ns)
         self._hold(own_ns)
         before_ns, known_ns = self._scene.depth_ns(own_ns), self._scene.next_ns(own_ns)
         next_ns = None if known_ns is None else self._scene.depth_ns(known_ns)
@@ -63,12 +63,12 @@ class NewerDepth:
         self._compare(known_ns, [(stamp_ns, q)])
 
     def _hold(self, now_ns: int) -> None:
-        late = self._scene.latency_ns
-        due = [state for state in self._waiting if state[0] + late <= now_ns]
+        own_ns = self._scene.own_ns
+        due = [state for state in self._waiting if own_ns(state[0]) <= now_ns]
         del self._waiting[: len(due)]
-        for _, together in groupby(due, key=lambda state: self._scene.depth_ns(state[0] + late)):
+        for _, together in groupby(due, key=lambda state: self._scene.depth_ns(own_ns(state[0]))):
             states = list(together)
-            self._compare(states[0][0] + late, states)
+            self._compare(own_ns(states[0][0]), states)
 
     def _compare(self, known_ns: int, states: Sequence[tuple[int, Float64]]) -> None:
         stamps = np.array([stamp for stamp, _ in states])

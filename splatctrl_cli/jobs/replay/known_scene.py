@@ -56,7 +56,7 @@ class KnownScene:
     """The scene a replay may use at each time; unknown before `first_ns` (None: always known).
 
     `at(stamp_ns)` returns the same object while a scene is in use. observed, cameras: None if not recorded.
-    stamps_ns: of scenes, each known `latency_ns` later; empty for one scene for all times. `advance` makes the scenes
+    stamps_ns: of scenes, each known from `known_ns` on; empty for one scene for all times. `advance` makes the scenes
     up to a stamp; call `finish` after the replay. box: of a grid's cell centres. moment_ns: of a baked field.
     seen_at: when space was last seen, as known at a stamp; without has_seen_times, if it ever was.
     """
@@ -67,7 +67,7 @@ class KnownScene:
     cameras: tuple[str, ...] | None
     digests: dict[str, str]
     stamps_ns: Sequence[int] = ()
-    latency_ns: int = 0
+    known_ns: Sequence[int] = ()
     advance: Callable[[int], None] = lambda stamp_ns: None
     finish: Callable[[], None] = lambda: None
     box: Box | None = None
@@ -94,23 +94,31 @@ class KnownScene:
         if index < 1:
             return None
         older_ns, newer_ns = self.stamps_ns[index - 1 : index + 1]
-        older, newer = (self.at(stamp + self.latency_ns).barrier for stamp in (older_ns, newer_ns))
+        older, newer = (self.at(known).barrier for known in self.known_ns[index - 1 : index + 1])
         return SceneStep(newer=newer, older=older, seconds=(newer_ns - older_ns) * 1e-9)
 
     def next_ns(self, stamp_ns: int) -> int | None:
         """Stamp [ns] from which the next scene is known; None if none follows within NEXT_SCENE_NS."""
         later = self._index_at(stamp_ns) + 1
         self.advance(stamp_ns + fixed.NEXT_SCENE_NS)
-        known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
-        return next((known for known in known_ns if known <= stamp_ns + fixed.NEXT_SCENE_NS), None)
+        latest = stamp_ns + fixed.NEXT_SCENE_NS
+        return next((known for known in self.known_ns[later : later + 1] if known <= latest), None)
+
+    def own_ns(self, stamp_ns: int) -> int:
+        """Stamp [ns] at which depth of this time is the newest known; `stamp_ns` without times."""
+        if not self.known_ns:
+            return stamp_ns
+        newest = max(0, bisect_right(self.stamps_ns, stamp_ns) - 1)
+        delay = self.known_ns[newest] - self.stamps_ns[newest]
+        return min([stamp_ns + delay, *(known - 1 for known in self.known_ns[newest + 1 : newest + 2])])
 
     def _index_at(self, stamp_ns: int) -> int:
         self.advance(stamp_ns)
-        return bisect_right(self.stamps_ns, stamp_ns - self.latency_ns) - 1
+        return bisect_right(self.known_ns, stamp_ns) - 1
 
 
 def fields_at(
-    stamps_ns: Sequence[int], latency_ns: int, key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
+    known_ns: Sequence[int], key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
 ) -> Callable[[int], KnownFields]:
     """Return a lookup of the newest scene at a stamp; it keeps the last HELD.
 
@@ -119,7 +127,7 @@ def fields_at(
     kept = lru_cache(maxsize=HELD)(fields_of)
 
     def at(stamp_ns: int) -> KnownFields:
-        index = bisect_right(stamps_ns, stamp_ns - latency_ns) - 1
+        index = bisect_right(known_ns, stamp_ns) - 1
         if index < 0:
             raise NotEvaluableError(f"no map is known yet at stamp {stamp_ns} ns", remedy="give a later time")
         return kept(key_of(index))
@@ -173,6 +181,8 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
             f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
         )
 
+    known_ns = tuple(stamp + latency_ns for stamp in stamps)
+
     def fields(stamp_ns: int | None) -> KnownFields:
         splats = scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns)
         return splat_fields(splats, config, threads, scene.unrepresented_at(stamp_ns))
@@ -186,20 +196,18 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
         return scene.seen() if is_last else scene.snapshot_at(stamps[index]).seen()
 
     def seen_at(stamp_ns: int) -> Seen | None:
-        index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0
+        index = bisect_right(known_ns, stamp_ns) - 1 if has_times else 0
         known = None if index < 0 else voxels(index)
         return None if known is None else seen_of(known)
 
     return KnownScene(
-        at=fields_at(
-            stamps if has_times else [-(2**63)], latency_ns, key_of if has_times else lambda _: None, fields
-        ),
+        at=fields_at(known_ns if has_times else [-(2**63)], key_of if has_times else lambda _: None, fields),
         observed=known_space(scene.occupancy()),
-        first_ns=stamps[0] + latency_ns if has_times else None,
+        first_ns=known_ns[0] if has_times else None,
         cameras=tuple(scene.cameras),
         digests={"splats.ply": sha256(path / "splats.ply")},
         stamps_ns=tuple(stamps) if has_times else (),
-        latency_ns=latency_ns,
+        known_ns=known_ns if has_times else (),
         seen_at=seen_at,
         figures=lambda: scene.run.get("metrics", {}),
     )

@@ -2,9 +2,12 @@
 
 import time
 from bisect import bisect_right
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,7 @@ from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
+from splatctrl_cli.formats.scene.scene_folder import MAP_DELAYS
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.jobs.check import refuse_errors
@@ -40,8 +44,10 @@ from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.time_steps import TimeStep
 
 FOLDER = "scene"  # within the replay's
+END: tuple[TimeStep | None, float] = (None, 0.0)  # of the frame sets
 
 
 def check_lockstep(request: ReplayRequest) -> None:
@@ -50,6 +56,8 @@ def check_lockstep(request: ReplayRequest) -> None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
     if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
+    if request.real_time and not request.lockstep:
+        raise UsageError("--real-time: expected --lockstep, as other maps exist already", remedy="leave it out")
     if not request.lockstep and request.device.startswith(CUDA):
         raise UsageError(f"--device {request.device}: expected --lockstep, as only a fit uses a GPU", remedy=TO_CPU)
 
@@ -126,6 +134,7 @@ def reconstruct_scene(
         int(request.latency * 1e9 + 0.5),
         console,
         ends_with_log=request.mode != "closed-loop",
+        is_real_time=request.real_time,
         held_out_every=every_of(request.evidence),
     ).scene()
 
@@ -133,8 +142,9 @@ def reconstruct_scene(
 class Lockstep:
     """Frame sets still to come, and stamps and files of the maps so far.
 
-    ends_with_log: known space is of the whole log, else of the frame sets passed. held_out_every: one in so many is
-    evidence and left out.
+    ends_with_log: known space is of the whole log, else of the frame sets passed. is_real_time: a map but the
+    first is known when this machine has computed it; of the frame sets that come meanwhile only the newest waits.
+    held_out_every: one in so many is evidence and left out.
     """
 
     def __init__(
@@ -145,22 +155,25 @@ class Lockstep:
         console: Progress,
         *,
         ends_with_log: bool,
+        is_real_time: bool = False,
         held_out_every: int | None = None,
     ) -> None:
         self._fitted, self._config, self._console = fitted, config, console
-        self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
+        self._latency_ns, self._ends_with_log, self._is_real_time = latency_ns, ends_with_log, is_real_time
         self._stopwatch = Stopwatch()
         self._taking: list[tuple[int, float]] = []  # stamp [ns] and duration [s] of each frame set
         self._held_out_every = held_out_every
-        self._steps = select_trained(fitted.time_steps(), held_out_every)
-        self._next = next(self._steps, None)
+        self._steps = self._decode(select_trained(fitted.time_steps(), held_out_every))
+        self._free_ns, self._num_dropped = 0, 0  # when the last frame set is done; frame sets left out
+        self._next, self._decoding = next(self._steps, END)
         self._stamps_ns: list[int] = []
+        self._known_ns: list[int] = []
         self._files: list[Path] = []
         self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
 
     def scene(self) -> KnownScene:
         """Return the scene of a replay; take frame sets up to the first map now."""
-        while self._next is not None and not self._stamps_ns:
+        while self._next is not None and (self._is_real_time or not self._stamps_ns):
             self._take()
         self._fitted.check_found()
 
@@ -168,7 +181,7 @@ class Lockstep:
             balls = read_unrepresented(file.with_suffix(".npz"))
             return splat_fields(read_ply(file)[0], self._config, self._fitted.request.threads, balls)
 
-        known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, fields)
+        known_at = fields_at(self._known_ns, self._files.__getitem__, fields)
         voxels = lru_cache(maxsize=1)(lambda file: read_seen(file.with_suffix(".npz")))
 
         def at(stamp_ns: int) -> KnownFields:
@@ -177,43 +190,78 @@ class Lockstep:
 
         def seen_at(stamp_ns: int) -> Seen | None:
             self._advance(stamp_ns)
-            index = bisect_right(self._stamps_ns, stamp_ns - self._latency_ns) - 1
+            index = bisect_right(self._known_ns, stamp_ns) - 1
             known = None if index < 0 else voxels(self._files[index])
             return None if known is None else seen_of(known)
 
         return KnownScene(
             at=at,
             seen_at=seen_at,
-            figures=self._fitted.metrics,
+            figures=self._figures,
             observed=self._observe,
-            first_ns=self._stamps_ns[0] + self._latency_ns,
+            first_ns=self._known_ns[0],
             cameras=tuple(self._fitted.cameras),
             digests={},
             stamps_ns=self._stamps_ns,
-            latency_ns=self._latency_ns,
+            known_ns=self._known_ns,
             advance=self._advance,
             finish=self._finish,
         )
 
     def _advance(self, stamp_ns: int) -> None:
-        while self._next is not None and self._next.stamp_ns + self._latency_ns <= stamp_ns:
+        while self._next is not None and self._start_ns(self._next) <= stamp_ns:
             self._take()
 
+    def _start_ns(self, step: TimeStep) -> int:
+        return max(step.stamp_ns + self._latency_ns, self._free_ns)
+
+    def _decode(self, steps: Iterator[TimeStep]) -> Iterator[tuple[TimeStep, float]]:
+        """Yield frame sets, each with the time [s] its decoding took."""
+        while True:
+            start = time.perf_counter()
+            with self._stopwatch.stage("read"):
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step, time.perf_counter() - start
+
     def _take(self) -> None:
-        step, fitted, start = self._next, self._fitted, time.perf_counter()
+        step, decoding, fitted, start = self._next, self._decoding, self._fitted, time.perf_counter()
         assert step is not None
         with self._stopwatch.stage("fit"), explain_faults(fitted.device):
             fitted.take(step, self._console)
-        with self._stopwatch.stage("read"):
-            self._next = next(self._steps, None)
-        taken = fitted.writer.snapshots
+        seconds = decoding + time.perf_counter() - start
+        self._next, self._decoding = next(self._steps, END)
+        start, taken = time.perf_counter(), fitted.writer.snapshots
         if self._next is None and fitted.rows and taken[-1].stamp_ns < step.stamp_ns:
             fitted.snapshot(step.stamp_ns)  # the log's last map, due or not
         fitted.writer.settle()
-        self._taking.append((step.stamp_ns, time.perf_counter() - start))
+        seconds += time.perf_counter() - start
+        self._taking.append((step.stamp_ns, seconds))
+        known_ns = self._start_ns(step)
+        if self._is_real_time:
+            known_ns += round(1e9 * seconds) if self._known_ns else 0
+            self._skip(known_ns)
         for snapshot in taken[len(self._files) :]:
             self._stamps_ns.append(snapshot.stamp_ns)
+            self._known_ns.append(known_ns)
             self._files.append(snapshot.path)
+
+    def _skip(self, free_ns: int) -> None:
+        """Drop all but the newest of the frame sets that came until now."""
+        self._free_ns = free_ns
+        while self._next is not None and self._next.stamp_ns + self._latency_ns <= free_ns:
+            newer, decoding = next(self._steps, END)
+            if newer is None or newer.stamp_ns + self._latency_ns > free_ns:
+                self._steps = self._steps if newer is None else chain([(newer, decoding)], self._steps)
+                return
+            self._next, self._decoding, self._num_dropped = newer, decoding, self._num_dropped + 1
+
+    def _figures(self) -> dict[str, Any]:
+        if not self._is_real_time:
+            return self._fitted.metrics()
+        delays = np.subtract(self._known_ns, self._stamps_ns) * 1e-9
+        return self._fitted.metrics() | {"num_dropped_sets": self._num_dropped, MAP_DELAYS: delays.tolist()}
 
     def _observe(self, points: Float64) -> UInt8:
         while self._ends_with_log and self._next is not None:
@@ -228,9 +276,7 @@ class Lockstep:
         """Write a scene folder; later frames go to `observe` alone."""
         fitted = self._fitted
         if fitted.observe is not None:
-            with self._stopwatch.stage("read"):
-                for _ in self._steps:
-                    pass
+            deque(self._steps, maxlen=0)
         with self._stopwatch.stage("write"):
             fitted.finish()
         write_run(
@@ -238,7 +284,7 @@ class Lockstep:
             command="replay",
             config=self._config.as_dict(),
             inputs=fitted.source.digests(),
-            metrics=fitted.metrics() | {EVERY: self._held_out_every},
+            metrics=self._figures() | {EVERY: self._held_out_every},
             stopwatch=self._stopwatch,
             seed=fitted.request.seed,
         )

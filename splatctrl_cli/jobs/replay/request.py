@@ -37,8 +37,9 @@ class ReplayRequest(RobotOptions, RunOptions):
     """One replay: the options of ``splatctrl replay``, by name.
 
     log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
-    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). Times are in seconds; start_time may be
-    "first-map". evidence: a held-out camera, or k for each k-th frame set. require_evidence, require_proof: no pass
+    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). real_time: a map of a lockstep is known when it is
+    computed. Times are in seconds; start_time may be "first-map". evidence: a held-out camera, or k for each k-th
+    frame set. require_evidence, require_proof: no pass
     without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
     ``module:Class``, a policy server's URL, or "recorded" for the log's commands; controller_command: a program
     (docs/controllers.md). separation: a TOML file of declared inputs (docs/separation.md). report_only: the verdict
@@ -53,6 +54,7 @@ class ReplayRequest(RobotOptions, RunOptions):
     field: Path | None = None
     lockstep: bool = False
     latency: float = 0.0
+    real_time: bool = False
     allow_disagreement: bool = False
     max_pose_jump: float = fixed.POSE_JUMP
     self_model: Path | None = None

@@ -96,7 +96,8 @@ def _time_inputs(declared: DeclaredSeparation, inputs: ReplayInputs) -> Iterator
             f"{inputs.source.name}: --separation: expected two maps or more to measure the reaction time",
             remedy="declare robot.reaction_time",
         )
-        latency, period = scene.latency_ns * 1e-9, float(np.median(np.diff(scene.stamps_ns))) * 1e-9
+        latency = max(np.subtract(scene.known_ns, scene.stamps_ns).tolist()) * 1e-9
+        period = float(np.median(np.diff(scene.stamps_ns))) * 1e-9
         how = f"latency {latency:g} s and period of the maps {period:.3g} s"
         yield SeparationInput(symbol="T_r", value=latency + period, unit="s", source=MEASURED, how=how)
     else:

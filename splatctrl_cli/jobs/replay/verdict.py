@@ -5,8 +5,11 @@ from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 
+import numpy as np
+
 from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict, gate_reasons, verdict_of
+from splatctrl_cli.formats.scene.scene_folder import MAP_DELAYS
 from splatctrl_cli.jobs.replay.criteria import CONTACT, SAFE, Judged, largest_about
 from splatctrl_cli.jobs.replay.evidence_criteria import OF_EVIDENCE, bound_words, find_displaced
 from splatctrl_cli.jobs.replay.metrics import counts_of, first_time
@@ -84,6 +87,11 @@ def _notes(judged: Judged) -> Iterator[str]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
+    scene = judged.inputs.scene.figures()
+    if (dropped := scene.get("num_dropped_sets")) is not None:
+        late, latest = np.median(scene[MAP_DELAYS]), max(scene[MAP_DELAYS])
+        num = f"{dropped} of {dropped + scene['time_steps']} frame sets were dropped"
+        yield f"in real time {num}; maps were {late:.2f} s late in the median, {latest:.2f} s at most"
     unseen, assumed = (largest_about(judged.replay.trace, name) for name in ("unseen", "assumed"))
     if unseen is None:
         yield "space about the arm not judged"

@@ -13,7 +13,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, refuse_faults, r
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.grid.iso_surface import iso_surface
 from splatctrl_cli.formats.grid.npz_grid import read_npz
-from splatctrl_cli.formats.scene.scene_folder import SceneFolder, Snapshot, open_scene
+from splatctrl_cli.formats.scene.scene_folder import MAP_DELAYS, SceneFolder, Snapshot, open_scene
 from splatctrl_cli.formats.splat.splats import nearest_splats, read_splats
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.runs.run_folder import REPLAY, RunFolder, States, open_run
@@ -166,12 +166,13 @@ def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
     """Snapshots a replay used, each with the motion time [s] it was known from."""
-    latency_ns = round(1e9 * float(run.option("--latency") or 0.0))
-    first, last = (int(stamp) - latency_ns for stamp in (states.stamps_ns[0], states.stamps_ns[-1]))
-    known = [s for s in scene.snapshots if s.stamp_ns <= last] if scene.has_clock else list(scene.snapshots[-1:])
-    early = [s for s in known if s.stamp_ns <= first]
-    used = [*early[-1:], *known[len(early) :]]
-    return [(max(0.0, 1e-9 * (snapshot.stamp_ns - first)), snapshot) for snapshot in used]
+    latency = float(run.option("--latency") or 0.0)
+    delays = scene.run.get("metrics", {}).get(MAP_DELAYS) or [latency] * len(scene.snapshots)
+    first, last = int(states.stamps_ns[0]), int(states.stamps_ns[-1])
+    known = [(s.stamp_ns + round(1e9 * delay), s) for delay, s in zip(delays, scene.snapshots, strict=True)]
+    known = [each for each in known if each[0] <= last] if scene.has_clock else known[-1:]
+    num_early = sum(known_ns <= first for known_ns, _ in known)
+    return [(max(0.0, 1e-9 * (known_ns - first)), snapshot) for known_ns, snapshot in known[max(0, num_early - 1) :]]
 
 
 def spread(times: list[float], when: float) -> list[int]:

@@ -36,9 +36,17 @@ def look_free(points: Float64) -> tuple[Index, UInt8]:
 
 
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
-    at = fields_at((100, 200), 50, lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
+    at = fields_at((150, 250), lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
     assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
     expect_refusal("no map is known yet at stamp 149 ns", at, 149, error=NotEvaluableError)
+
+
+def test_the_depth_of_a_time_is_the_newest_known_until_the_next_map_is() -> None:
+    alone = KnownScene(at=lambda _: None, observed=None, first_ns=None, cameras=None, digests={})  # type: ignore[arg-type, return-value]
+    assert alone.own_ns(5) == 5
+    scene = replace(alone, stamps_ns=(0, 100, 200), known_ns=(90, 130, 290))
+    assert [scene.own_ns(stamp) for stamp in (-10, 0, 39, 50, 150, 250)] == [80, 90, 129, 129, 180, 340]
+    assert [scene.depth_ns(scene.own_ns(stamp)) for stamp in (0, 39, 50, 150, 250)] == [0, 0, 0, 100, 200]
 
 
 @pytest.mark.parametrize(("stamp_ns", "age_s"), [(1 * SECOND, 2.0), (3 * SECOND, 0.0), (7 * SECOND, 4.0)])

@@ -1,6 +1,7 @@
 """``splatctrl replay --lockstep`` and ``--latency``: what is known of the scene at each time, and since when."""
 
 import csv
+import json
 import re
 import weakref
 from collections.abc import Callable, Collection, Iterator
@@ -15,16 +16,20 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.jobs.replay import known_scene
+from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction
+from splatctrl_cli.jobs.replay import known_scene, lockstep
 from splatctrl_cli.jobs.replay import replay as job
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, read_splat_scene
 from splatctrl_cli.jobs.replay.lockstep import check_lockstep, reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayRequest
+from splatctrl_cli.jobs.report.spaces import scene_of, sets_known
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.time_steps import TimeStep
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
 from tests.jobs.bake.baked import Said
 from tests.jobs.running.test_device import cards, run_of
@@ -43,6 +48,7 @@ class Replayed(NamedTuple):
 
     rows: list[dict[str, str]]
     stamps: dict[str, list[int]]
+    out: Path
 
 
 Replays = Callable[..., Replayed]
@@ -75,7 +81,7 @@ def replayed(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) ->
             patch.setattr(job, "clock_of", watched)
             assert main(words) in (0, 3)
         with (out / "steps.csv").open() as stream:
-            return Replayed(list(csv.DictReader(stream)), stamps)
+            return Replayed(list(csv.DictReader(stream)), stamps, out)
 
     return replay
 
@@ -130,6 +136,21 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
     }
 
 
+def test_a_replay_in_real_time_names_what_it_dropped(replayed: Replays) -> None:
+    summary = replayed("--real-time", every=1).out / "summary.json"
+    notes = "; ".join(json.loads(summary.read_text(encoding="utf-8"))["verdict"]["notes"])
+    assert re.search(r"in real time \d of 5 frame sets were dropped; maps were 0\.\d\d s late in the median", notes)
+    run = open_run(summary.parent)
+    states, metrics = run.states, run_of(summary.parent / "scene")["metrics"]
+    since = [time for time, _ in sets_known(run, states, scene_of(run))]
+    stamps = [snapshot.stamp_ns for snapshot in scene_of(run).snapshots]
+    known = [stamp + round(1e9 * delay) for stamp, delay in zip(stamps, metrics["map_delays_s"], strict=True)]
+    used = [max(0.0, 1e-9 * (each - states.stamps_ns[0])) for each in known if each <= states.stamps_ns[-1]]
+    assert since == used[-len(since) :]
+    with pytest.raises(UsageError, match="--real-time: expected --lockstep"):
+        check_lockstep(ReplayRequest(log=Path(), scene=Path(), real_time=True))
+
+
 def test_the_log_is_read_four_times(
     replayed: Replays, small_recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +186,48 @@ def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
         check_lockstep(ReplayRequest(log=small_recording, out=tmp_path, scene=tmp_path, device="cuda"))
 
 
+@pytest.mark.parametrize(
+    ("seconds", "used", "delays"),
+    [
+        (0.05, [0, 1, 2, 3, 4], [0.0, 0.05, 0.05, 0.05, 0.05]),
+        (0.25, [0, 1, 2, 3, 4], [0.0, 0.25, 0.3, 0.35, 0.4]),
+        (0.5, [0, 1, 3, 4], [0.0, 0.5, 0.6, 0.9]),
+        (0.7, [0, 1, 4], [0.0, 0.7, 0.8]),
+    ],
+)
+def test_in_real_time_a_map_is_known_when_it_is_computed_and_the_newest_frame_set_waits(
+    small_recording: Path,
+    tmp_path: Path,
+    arm: RobotModel,
+    monkeypatch: pytest.MonkeyPatch,
+    seconds: float,
+    used: list[int],
+    delays: list[float],
+) -> None:
+    """Five frame sets, 0.2 s apart, on a machine that computes each for the same time."""
+    now, take = [0.0], Reconstruction.take
+
+    def take_long(fitted: Reconstruction, step: TimeStep, console: Progress) -> Any:
+        now[0] += seconds
+        return take(fitted, step, console)
+
+    monkeypatch.setattr(lockstep.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(Reconstruction, "take", take_long)
+    scene = opened(small_recording, tmp_path, arm, latency=0.0, is_real_time=True)
+    first = scene.stamps_ns[0]
+    assert scene.first_ns == first  # a live run begins with a map
+    for tenths in range(1, 30):
+        now_ns = first + tenths * SECOND // 10
+        assert len(scene.stamps_ns) >= sum(known <= now_ns for known in scene.known_ns)
+        scene.advance(now_ns)
+    np.testing.assert_allclose(np.subtract(scene.stamps_ns, first) / SECOND, 0.2 * np.array(used), atol=1e-3)
+    np.testing.assert_allclose(np.subtract(scene.known_ns, scene.stamps_ns) / SECOND, delays, atol=1e-3)
+    assert scene.figures()["num_dropped_sets"] == 5 - len(used)
+    for stamp, known in zip(scene.stamps_ns, scene.known_ns, strict=True):
+        assert scene.depth_ns(known) == scene.depth_ns(scene.own_ns(stamp)) == stamp
+        assert scene.depth_ns(known - 1) != stamp
+
+
 def test_it_says_how_long_a_frame_set_took(small_recording: Path, tmp_path: Path, arm: RobotModel) -> None:
     said = Said()
     scene = opened(small_recording, tmp_path, arm, latency=0.0, console=said)
@@ -183,6 +246,7 @@ def opened(
     arm: RobotModel,
     *,
     latency: float,
+    is_real_time: bool = False,
     device: str = "auto",
     console: Progress = SILENT,
 ) -> known_scene.KnownScene:
@@ -194,6 +258,7 @@ def opened(
         lockstep=True,
         device=device,
         latency=latency,
+        real_time=is_real_time,
         mode="closed-loop",
         threads=1,
         config=load_config(None, SETTINGS),
