@@ -14,7 +14,7 @@ demo: $(RUNS)
 test: lint types tests
 
 lint: $(STAMP)
-	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/python -m tools.docstrings
 
 types: $(STAMP)
 	$(BIN)/mypy

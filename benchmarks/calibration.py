@@ -174,7 +174,7 @@ def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
         truth = invert_transform(setup.off[name]) if found.moves else cameras[name]
         twist = twist_between(truth, found.T)
         R = np.eye(3) if found.moves else truth[:3, :3]
-        if "pose" not in found.held:
+        if "pose" not in found.as_recorded:
             for unknown, error, sigma in (
                 ("position", R @ twist[3:], found.sigma_position),
                 ("rotation", R @ twist[:3], found.sigma_rotation),
@@ -183,7 +183,7 @@ def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
                     yield Error(
                         **named, camera=name, unknown=unknown, axis=axis, error=float(error[axis]), sigma=sigma[axis]
                     )
-        if "depth scale" not in found.held:
+        if "depth scale" not in found.as_recorded:
             apart = found.scale - (setup.scale if name == setup.names[0] else 1.0)
             yield Error(**named, camera=name, unknown="depth scale", axis=0, error=apart, sigma=found.sigma_depth[0])
     if result.calibration.clock is not None:

@@ -23,7 +23,7 @@ from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.simulate.render import Renderer
-from splatctrl_cli.simulate.tabletop import cameras, furniture, things
+from splatctrl_cli.simulate.tabletop import cameras, furniture, objects
 from tests.plain import plain_frame
 
 NUM_VIEWS = (8, 16, 31)
@@ -86,7 +86,7 @@ def views_on_a_circle(num_views: int) -> list[RgbdFrame]:
         angle = 2 * np.pi * index / num_views
         eye = (0.5 + 0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.8)
         camera = replace(cameras(320, 240)[0], T_world_camera=look_at(eye, (0.5, 0.0, 0.0)))
-        color, depth = Renderer(camera, [*furniture(), *things()], color_rays=0).image([])
+        color, depth = Renderer(camera, [*furniture(), *objects()], color_rays=0).image([])
         place: dict[str, Any] = {"stamp_ns": index, "camera": f"{index:03d}", "color": color}
         frames.append(plain_frame(depth, camera.intrinsics, camera.T_world_camera, **place))
     return frames

@@ -158,7 +158,7 @@ def verdict_on(robot: MeasuredRobot, position: Float64, stamp_ns: int, known: Kn
         truth=None,
         digests={},
         surfaces=robot.surfaces,
-        kept=robot.kept,
+        pair_margins=robot.pair_margins,
     )
     request = ReplayRequest(log=REQUEST.log, out=REQUEST.out, config=config)
     found = replayed(request, inputs, SILENT)

@@ -25,7 +25,7 @@ def transform_points(T: Float64, points: Floats) -> Float64:
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
     """Rotation of a finite, nonzero quaternion.
 
-    Scaling by a power of two rounds nothing; squares of a tiny one would underflow.
+    It is scaled first, as squares of a tiny one would underflow; a power of two does not round.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     quat = np.ldexp(quat, -np.frexp(np.abs(quat).max())[1])

@@ -112,7 +112,7 @@ Item = TypeVar("Item")
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most `most` items, in order, evenly spread."""
+    """Choose `most` items or fewer, in order, evenly spread."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 

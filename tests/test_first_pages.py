@@ -64,7 +64,7 @@ def assert_alike(shown: str, printed: str) -> None:
 
 def test_the_two_verdicts_of_the_readme_are_what_its_commands_say(said: Said) -> None:
     shown = re.findall(r"^    (replay: .*)$", README.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    assert "The two replays say, and end with exit code 0:" in README.read_text(encoding="utf-8")
+    assert "The two replays print, with exit code 0:" in README.read_text(encoding="utf-8")
     assert set(said.codes.values()) == {0}
     for line, out in zip(shown, ("out/audit", "out/closed_loop"), strict=True):
         assert_alike(line, said.results[out]["verdict"]["sentence"])

@@ -174,12 +174,12 @@ SHOW = "show the board to neighbouring cameras at the same moment, or keep some 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Recorded T_world_camera (4, 4) by camera and stamp [ns], moving cameras, robot, held cameras."""
+    """Recorded T_world_camera (4, 4) by camera and stamp [ns], moving cameras, robot, cameras that stay."""
 
     recorded: Mapping[str, Mapping[int, Float64]]
     moving: frozenset[str]
     arm: Arm | None = None
-    held: Sequence[str] = ()
+    anchors: Sequence[str] = ()
 
 
 HandEye = tuple[Float64, Float64, float]
@@ -189,17 +189,17 @@ HandEye = tuple[Float64, Float64, float]
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
     """T_recorded_camera (4, 4) by camera, from sightings of a board.
 
-    Without a robot or a moving camera, the board ties all others to the `held` cameras. Otherwise hand-eye
+    Without a robot or a moving camera, the board ties all others to the `anchors`. Otherwise hand-eye
     calibration first places a moving camera by a stationary board, or a stationary one by a board on a link. Raises
     NotEvaluableError for too few sightings, other squares, or cameras that this does not reach.
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)
-    placed = {camera: np.eye(4) for camera in rig.held}
+    placed = {camera: np.eye(4) for camera in rig.anchors}
     T_world_board: Float64 | None = None
     stands = _board_stands(by_camera, rig)
     reasons: list[str] = []
-    for camera in [camera for camera in rig.recorded if camera not in rig.held]:
+    for camera in [camera for camera in rig.recorded if camera not in rig.anchors]:
         try:
             if camera in rig.moving and stands:
                 X, stays, off = hand_eye(
@@ -207,7 +207,7 @@ def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[s
                 )
                 _check_fit(off, f"{camera}, which moves,")
                 placed[camera], T_world_board = X, stays
-            elif camera not in rig.moving and not stands and rig.arm is not None and not rig.held:
+            elif camera not in rig.moving and not stands and rig.arm is not None and not rig.anchors:
                 T_world_camera = _place_by_link(rig.arm, by_camera[camera])
                 placed[camera] = (
                     invert_transform(rig.recorded[camera][by_camera[camera][0].stamp_ns]) @ T_world_camera

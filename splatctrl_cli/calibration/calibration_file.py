@@ -26,8 +26,8 @@ class CalibratedCamera:
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
     [m], sigma_rotation (3,) [rad]: in the world's axes, or a moving camera's own. sigma_depth: of scale and bias.
-    depth_noticed: the least noticeable |scale - 1| and |bias| [m], or inf. held: parts not solved for. unobserved:
-    directions kept as recorded.
+    depth_noticed: the least noticeable |scale - 1| and |bias| [m], or inf. as_recorded: parts not solved for.
+    unobserved: directions kept as recorded.
     """
 
     T: Float64
@@ -39,7 +39,7 @@ class CalibratedCamera:
     sigma_depth: tuple[float, ...] = (0.0, 0.0)
     depth_noticed: tuple[float, ...] = (math.inf, math.inf)
     covariance: Float64 = field(default_factory=lambda: np.zeros((6, 6)))
-    held: tuple[str, ...] = ()
+    as_recorded: tuple[str, ...] = ()
     unobserved: tuple[str, ...] = ()
 
     @property
@@ -59,13 +59,13 @@ class Calibration:
     world_frame: str
     digests: Mapping[str, str]
     cameras: Mapping[str, CalibratedCamera]
-    held: tuple[str, ...] = ()
+    as_recorded: tuple[str, ...] = ()
     clock: float | None = None
     sigma_clock: float = 0.0
 
     def is_held(self, camera: str) -> bool:
         """True if the camera's pose stayed as recorded."""
-        return f"camera {camera}" in self.held
+        return f"camera {camera}" in self.as_recorded
 
 
 def calibration_text(calibration: Calibration) -> str:
@@ -74,7 +74,7 @@ def calibration_text(calibration: Calibration) -> str:
         f"version = {VERSION}",
         f"recording = {_text(calibration.recording)}",
         f"world_frame = {_text(calibration.world_frame)}",
-        f"held = {_list(map(_text, calibration.held))}  # taken as recorded",
+        f"held = {_list(map(_text, calibration.as_recorded))}  # taken as recorded",
     ]
     if calibration.clock is not None:
         meaning = "# [s] a frame's stamp less that of the joint state at that instant"
@@ -98,7 +98,7 @@ def calibration_text(calibration: Calibration) -> str:
             f"sigma_rotation = {_numbers(camera.sigma_rotation)}  # [rad], about {axes} axes",
             f"sigma_depth = {_numbers(camera.sigma_depth)}  # of depth_scale and depth_bias [m]",
             f"depth_noticed = {_numbers(camera.depth_noticed)}  # off by less, they would be taken as recorded",
-            f"held = {_list(map(_text, camera.held))}",
+            f"held = {_list(map(_text, camera.as_recorded))}",
             f"unobserved = {_list(map(_text, camera.unobserved))}",
             f"covariance = {_list(_numbers(row) for row in camera.covariance)}  # of position, rotation",
         ]
@@ -137,7 +137,7 @@ def read_calibration(path: Path) -> Calibration:
             world_frame=str(content["world_frame"]),
             digests={str(name): str(value) for name, value in content["digests"].items()},
             cameras={str(name): _camera(entry) for name, entry in content["cameras"].items()},
-            held=tuple(map(str, content["held"])),
+            as_recorded=tuple(map(str, content["held"])),
             clock=None if clock is None else _finite([clock["offset"]], 1)[0],
             sigma_clock=0.0 if clock is None else _finite([clock["sigma"]], 1)[0],
         )
@@ -159,7 +159,7 @@ def describe_calibration(path: Path) -> Summary:
             f"{np.degrees(max(camera.sigma_rotation)):.3f}",
             f"{camera.scale:.5g}",
             f"{1e3 * camera.bias:.1f}",
-            "; ".join((*camera.held, *(f"not observed: {text}" for text in camera.unobserved))) or "-",
+            "; ".join((*camera.as_recorded, *(f"not observed: {text}" for text in camera.unobserved))) or "-",
         ]
         for name, camera in calibration.cameras.items()
     ]
@@ -167,7 +167,7 @@ def describe_calibration(path: Path) -> Summary:
     facts: dict[str, object] = {
         "recording": calibration.recording,
         "world_frame": calibration.world_frame,
-        "held": list(calibration.held),
+        "held": list(calibration.as_recorded),
         "clock_offset_s": calibration.clock,
     }
     return Summary(
@@ -191,7 +191,7 @@ def _camera(entry: Mapping[str, Any]) -> CalibratedCamera:
         sigma_depth=_finite(entry["sigma_depth"], 2),
         depth_noticed=tuple(map(float, entry["depth_noticed"])),
         covariance=covariance,
-        held=tuple(map(str, entry["held"])),
+        as_recorded=tuple(map(str, entry["held"])),
         unobserved=tuple(map(str, entry["unobserved"])),
     )
 

@@ -181,7 +181,9 @@ def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
 
 
 def _gray_differences(a: GrayView, b: GrayView, number: Index, pixels: Float64) -> tuple[Float64, Float64]:
-    """Grey differences (K,) of view a's points `number` from view b at pixels (K, 2), and b's slopes (K, 2) there."""
+    """Grey differences (K,) of view a's points `number` from view b, and b's slopes (K, 2).
+
+    Both are at pixels (K, 2) of b."""
     u, v = np.round(pixels).astype(np.int64).T
     slope = b.slope[v, u].astype(np.float64)
     value = b.gray[v, u] + np.einsum("ki,ki->k", slope, pixels - np.stack([u, v], axis=1))

@@ -93,8 +93,8 @@ def bends_alone() -> Float64:
 class BentViews:
     """Views, and the bends (C, G) of their cameras to solve for.
 
-    cameras (N,): number of each view's camera, `HELD` where its depth stays as it is. now: the views without current
-    bends.
+    cameras (N,): number of each view's camera, or `HELD` where depth stays as recorded. now: the views with the
+    current bends removed.
     """
 
     recorded: Sequence[GrayView]
@@ -370,7 +370,10 @@ def _agrees_better(
 
 
 def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float]:
-    """Share of the misfit (K,) gained, and that by its standard error over tiles (K,); 0 without common points."""
+    """Share of the misfit (K,) gained, and its ratio (K,) to its standard error over tiles.
+
+    Both are 0 without common points.
+    """
     is_known = np.isfinite(before) & np.isfinite(after)
     gain, of_tile = (before - after)[is_known], np.unique(tiles[is_known], return_inverse=True)[1]
     if not gain.any():

@@ -50,8 +50,8 @@ class Solution:
         return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
 
 
-def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution:
-    """Calibrate all cameras but `held`.
+def solved(evidence: Evidence, start: Estimate, anchors: Sequence[str]) -> Solution:
+    """Calibrate all cameras but `anchors`.
 
     Raises NotEvaluableError if cameras share no surface, or two solutions fit alike.
     """
@@ -60,7 +60,7 @@ def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution
         evidence,
         Unknowns(
             cameras=cameras,
-            poses=[camera for camera in cameras if camera not in held],
+            poses=[camera for camera in cameras if camera not in anchors],
             has_clock=evidence.arm is not None,
         ),
     )

@@ -131,7 +131,7 @@ def motion_findings(
     model: RobotModel | None,
     units: Iterable[float | None] = (None,),
 ) -> list[Finding]:
-    """Findings on joint states (in the model's order, if any) by the cameras.
+    """Findings on joint states (in the model's order, if any) against the cameras.
 
     frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
     """
@@ -162,7 +162,9 @@ def _arm_findings(
         where = f"camera {camera}"
         agreement = arm_agreement(model, its, posture)
         if agreement is None:
-            findings.append(note("arm", where, "too little of the arm is in view to compare it with the joints"))
+            findings.append(
+                note("arm", where, "too little of the arm is in view to compare its depth with the joint states")
+            )
             continue
         timing = arm_timing(model, its, posture)
         if timing is not None:
@@ -173,7 +175,7 @@ def _arm_findings(
                 warning(
                     "arm",
                     where,
-                    f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say",
+                    f"the arm's depth is {agreement.scale:.3g} times its distance by the joint states",
                     f"{rescale_remedy(units, 1 / agreement.scale)}, or check --base and the camera's pose",
                     value=round(agreement.scale, 3),
                 )
@@ -183,9 +185,9 @@ def _arm_findings(
                 note(
                     "arm",
                     where,
-                    f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); in"
-                    f" {agreement.num_frames} depth images {100 * agreement.seen_through:.0f} % of"
-                    f" {agreement.num_pixels} pixels show what is behind it",
+                    f"the arm's depth is {1e3 * agreement.median:+z.0f} mm behind its surface (median of"
+                    f" {agreement.num_pixels} pixels in {agreement.num_frames} images);"
+                    f" {100 * agreement.seen_through:.0f} % of them show the background",
                     value=round(1e3 * agreement.median, 1),
                     unit="mm",
                 )
@@ -228,7 +230,10 @@ def _own_offsets(
 
 
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
-    """Remedy that names two joints whose exchange puts the arm where depth shows it; empty without such a pair."""
+    """Remedy that names two joints to exchange.
+
+    The arm is then where depth shows it; empty without such a pair.
+    """
     few = spread(thin_frames(frames), limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
     tried = (
@@ -261,8 +266,8 @@ def _timing_findings(offsets: Mapping[str, float]) -> list[Finding]:
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
     return _clock_finding(
         where,
-        f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
-        f" by where depth shows the arm){rest}",
+        f"frames are stamped {1e3 * offset_s:+z.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
+        f" by the arm's depth){rest}",
         offset_s,
         limits.TIME_OFFSET + limits.TIME_ERROR,
         round(1e3 * offset_s, 1),

@@ -54,7 +54,7 @@ class PoseAgreement:
     """Logged end-effector poses against forward kinematics.
 
     difference: from `link`, the nearest. offset (4, 4): the constant transform that explains most, T_link_ee of a
-    tool or T_logged_base of a wrong base. rest: what remains.
+    tool or T_logged_base of a wrong base. rest: the difference that remains.
     """
 
     verdict: PoseVerdict
@@ -70,8 +70,8 @@ class PoseAgreement:
         by = f"({x:.4f}, {y:.4f}, {z:.4f}) m and {np.degrees(_angle(self.offset[:3, :3])):.1f} deg"
         words: dict[PoseVerdict, str] = {
             "agree": f"agree with {self.link}: {self.difference.words}",
-            "tool": f"stand at {by} in {self.link}: a flange or tool transform; beside it {self.rest.words}",
-            "base": f"are moved by {by} in the world: is --base right? beside it {self.rest.words}",
+            "tool": f"stand at {by} in {self.link}: a flange or tool transform; apart from that {self.rest.words}",
+            "base": f"are moved by {by} in the world: is --base right? apart from that {self.rest.words}",
             "still": "cannot be judged: the robot hardly moves",
             "disagree": f"do not fit this robot, with any tool: {self.rest.words} from {self.link}; "
             "wrong URDF, joint order, or units?",

@@ -75,7 +75,7 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
 
 
 def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """Depth factor by camera that makes views fit, if any; a common one first."""
+    """Depth factor by camera that makes views agree: one for all, else by camera."""
     cameras = sorted({view.camera for view in views})
     together = _best_scale(views, pairs, cameras)
     if together is not None:

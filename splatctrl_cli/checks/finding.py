@@ -36,7 +36,7 @@ class Check:
 
     @property
     def docs(self) -> str:
-        """Its line in docs/check.md: code and severity, a bar, meaning."""
+        """The row in docs/check.md: code and severity, a bar, meaning."""
         return f"`{self.code}` ({'/'.join(self.severities)}) | {self.meaning}"
 
 
@@ -44,13 +44,13 @@ _TABLE = """
 # code | severities | commands that an error blocks | meaning | what to do, where a finding does not say
 damaged | warning |  | part of the file cannot be read | copy the file again; if it stays,
     look at what wrote these messages
-remark | note |  | how something was read, or messages that are not
+remark | note |  | how data was interpreted, or messages that are not read
 loss | note |  | topics and frames left out
 missing | error | all | depth, CameraInfo or tf that `ingest` needs
 refused | error | all | the capture or folder cannot be read as described
 gap | warning |  | a topic pauses for over 0.1 s and three median intervals | record fewer topics or to a faster disk;
     what moved meanwhile is unknown
-part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log |
+part | note, warning |  | a topic begins over 1 s late or ends over 1 s early; a warning from a tenth of the log |
     start and stop all drivers with the recorder, or cut the log there
 files-apart | warning |  | over 60 s between two files | are they one recording? if not, give each alone
 stamp-repeats | warning |  | repeated header stamps | look for a driver that publishes twice, or a topic recorded
@@ -68,8 +68,8 @@ robot-clock | note, warning |  | the offset of cameras and robot: a warning beyo
     ms and twice its uncertainty
 sampled | note |  | not every image was decoded
 undecodable | note, warning, error | all | undecodable images; an error if all | they are left out;
-    record a form that is read, or copy the file again where it is named as damaged too
-encoding | note, warning |  | not read, or changing
+    record a supported encoding, or copy the file again if it is damaged too
+encoding | note, warning |  | an encoding that is not read, or changes
 image-size | note, warning |  | images of several sizes on one topic | record one size; frames of another than the
     camera's are left out
 pairing | warning, error | all | under 95 % of images find a partner; an error if none
@@ -79,7 +79,7 @@ pair-offset | note |  | depth over 10 ms from its colour image | let the driver 
     moves is in two places
 depth-scale | note, error | all | median depth outside 0.05 to 20 m; a note outside 0.15 to 8 m
 depth-share | note, warning |  | under half of the pixels have depth; a warning below a tenth | the rest stays unseen:
-    dark or shiny things, too near, or warped depth with holes
+    dark or shiny objects, too near, or warped depth with holes
 depth-empty | warning, error | later | images without depth; an error if all | is the projector on, and the
     scene within its range?
 depth-invalid | note |  | NaN, infinite, negative or no-return pixels
@@ -108,8 +108,8 @@ pose-missing | warning, error | all | images without a pose; an error if all | t
 pose-jump | error | later | a camera moves over 0.2 m and ten times its median step in one frame | two publishers of
     one frame, or a localisation that was corrected; reconstruct refuses it
 alignment | error | later | edges of depth and colour are over 1.5 % of the width apart, or match across cameras
-views-scale | warning, error | later | the factor that makes depths fit; a warning at little overlap
-views-pose | warning |  | how far a camera must move for its views to fit (from 12 mm or 0.8 deg)
+views-scale | warning, error | later | depths fit only with a factor; a warning at little overlap
+views-pose | warning |  | views fit only after a camera moves (by 12 mm or 0.8 deg)
 agreement | note, error | later | how far apart views place one surface [mm]; an error beyond 30 mm (3 % of depth
     above 1 m)
 views-agreement | error | later | the same for views of one camera
@@ -123,8 +123,8 @@ joints-still | note |  | no joint moves
 joints-limits | warning |  | states beyond the URDF's limits | is it the right URDF, are the joints in its units, or
     were its limits lowered?
 end-effector | note, error | replay | logged poses against the robot's kinematics
-arm | note, warning |  | measured minus rendered depth of the robot [mm]; a warning beyond 30 mm (mean 25), at 4 %
-    throughout, or where a quarter shows the background
+arm | note, warning |  | measured minus rendered depth of the robot [mm]; a warning beyond 30 mm (mean 25), from 4 %
+    of scale, or where a quarter shows the background
 robot-model | warning |  | `--urdf` is another mechanism than the log's
 quick | note |  | only the first images were read
 """
@@ -212,9 +212,9 @@ class Rate:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """A checked recording: findings, rates by topic; lacks: by later command what it misses, "" for nothing.
+    """A checked recording.
 
-    frames: reduced views, without colour, of cameras with poses.
+    lacks: missing data by later command, "" for none. frames: reduced views, without colour, of posed cameras.
     """
 
     path: str

@@ -34,7 +34,7 @@ def _lines(result: CalibrateResult) -> Iterator[str]:
     if calibration.clock is not None:
         sign = f"{1e3 * calibration.clock:+.1f} ms"
         yield f"frames are stamped {sign} against the joint states (sigma {1e3 * calibration.sigma_clock:.1f} ms)"
-    yield from (f"taken as recorded: {', '.join(calibration.held) or 'nothing'}", f"wrote {result.out}")
+    yield from (f"taken as recorded: {', '.join(calibration.as_recorded) or 'nothing'}", f"wrote {result.out}")
 
 
 def _row(result: CalibrateResult, name: str) -> list[object]:

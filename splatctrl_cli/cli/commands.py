@@ -175,7 +175,7 @@ COMMANDS = {
         options=run_options.INFO,
     ),
     "check": Command(
-        summary="say what is wrong with a log, capture or image folder",
+        summary="list the faults of a log, capture or image folder",
         examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
         run="check:run",
         judges=True,

@@ -192,7 +192,7 @@ def output(what: str, *, default: str) -> tuple[Adds, ...]:
 
 
 def settings(example: str = "") -> tuple[Adds, ...]:
-    paper = "paper: as printed (splatctrl help paper has our departures)"
+    paper = "paper: the printed settings (departures: splatctrl help paper)"
     return (
         option("--set SECTION.KEY=VALUE ...", f"one setting{example}"),
         option("--preset NAME", paper, _preset, dest="set", action="append"),
@@ -229,7 +229,7 @@ DEVICE = join_run_options(
 GATES = option("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
 HOLDOUT = option(
     "--holdout 0,6",
-    "keep frames of an image folder for judging, as camera holdout",
+    "hold out these frames of an image folder, as camera holdout",
     partial(_split_list, "--holdout"),
     fields={"holdout": lambda text: tuple(text.split(","))},
 )
@@ -356,7 +356,7 @@ class Console:
     def show(
         self, result: Result, lines: Iterable[str], *, code: int | None = None, has_findings: bool = False
     ) -> int:
-        """Print a job's verdict, if it judges, and its document or `lines`; return the exit code.
+        """Print a job's verdict, if any, and its document or `lines`; return the exit code.
 
         has_findings: `lines` contain the reasons.
         """

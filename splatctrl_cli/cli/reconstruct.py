@@ -39,8 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return console.show(result, [*_lines(result), f"wrote {result.out}"])
 
 
-def recording_of(args: argparse.Namespace, path: Path, beside: tuple[Path, ...] = ()) -> RecordingRequest:
-    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=args.dtu is not None, beside=beside)
+def recording_of(args: argparse.Namespace, path: Path, others: tuple[Path, ...] = ()) -> RecordingRequest:
+    return request_of(RecordingRequest, args, path=args.dtu or path, is_dtu=args.dtu is not None, others=others)
 
 
 def _lines(result: Result) -> list[str]:

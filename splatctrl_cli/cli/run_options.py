@@ -140,13 +140,15 @@ SIMULATE = (
 INGEST = (
     option("SOURCE", f"{FILES}, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+", fields={"paths": tuple}),
     *output("capture folder", default="NAME.capture in this folder, NAME that of SOURCE"),
-    option("--resume", "continue an interrupted run, if there is one, to the same bytes"),
+    option("--resume", "continue an interrupted run, if there is one; the result has the same bytes"),
     *OF_FOLDERS,
 )
 INFO = (option("PATH", "file or folder", Path), *OF_FOLDERS)
 CHECK = (
     option("SOURCE", f"{FILES}, capture, {OTHERS}; {SEVERAL_LOGS}", Path, nargs="+", fields={"paths": tuple}),
-    option("--fail-on", "exit with 1 where a finding is as bad as this", ("error", "warning", "never"), "error"),
+    option(
+        "--fail-on", "exit with 1 for a finding of this severity or worse", ("error", "warning", "never"), "error"
+    ),
     option(
         "--quick N",
         f"read the first N images of a topic only (default of N: {QUICK})",

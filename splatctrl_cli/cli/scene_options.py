@@ -48,9 +48,9 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 RECONSTRUCT = (
     option("SOURCE", "log, capture folder, or an image folder's .toml", Path, nargs="?", fields={"recording": Path}),
-    option("--dtu ROOT", "a DTU data set in MVSNet's layout, or in IDR's and NeuS's, instead", Path),
+    option("--dtu ROOT", "instead, a DTU data set in the layout of MVSNet, or of IDR and NeuS", Path),
     *output("scene folder", default="scene"),
-    option("--resume", "continue an interrupted run, to the same bytes"),
+    option("--resume", "continue an interrupted run; the result has the same bytes"),
     option("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path),
     option("--spheres FILE.yaml", "its collision spheres", Path),
     SELF_MODEL,
@@ -119,8 +119,10 @@ EXPORT = (
 SDF_BAKE = (
     option("SCENE", "a folder that reconstruct wrote, or a file of round splats: .ply, .splat, .spz", Path),
     *output("folder to write: the grid, field.json, report/, run.json", default="field"),
-    option("--at SECONDS", "the scene as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
-    option(f"--box {BOX}", "what the grid covers [m]; write --box=-1,... for a negative start", fields=AS_BOX),
+    option("--at SECONDS", "the scene as known at this time after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
+    option(
+        f"--box {BOX}", "box that the grid covers [m]; write --box=-1,... if it begins with a minus", fields=AS_BOX
+    ),
     option("--urdf URDF", "cover the reach of this robot around its base, without --box", Path),
     option("--voxel M", "cell size (field.voxel)", sets=(FieldConfig, "voxel")),
     option(
@@ -132,7 +134,7 @@ SDF_BAKE = (
     ),
     option("--truth truth.json", "measure the field against this truth", Path),
     option("--seen-by LOG", "the log or capture whose cameras saw the scene, for --truth", Path),
-    option("--resume", "continue an interrupted bake, to the same bytes"),
+    option("--resume", "continue an interrupted bake; the result has the same bytes"),
     *CONFIG,
     DEVICE,
     GATES,
@@ -204,7 +206,7 @@ QUERY = (
     ),
     *output("CSV file of the answers, in the order of the points", default="stdout, with --json none"),
     option("--scene SCENE", "what SOURCE, a field, was baked from: adds what a grid does not know", Path),
-    option("--at SECONDS", "of a scene: as known that long after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
+    option("--at SECONDS", "of a scene: as known at this time after its start", real(-MAX_SECONDS, MAX_SECONDS, "s")),
     option(
         "--include NAME,...",
         "of a scene: labels that count in addition to object: robot, human, or none",
@@ -220,7 +222,7 @@ QUERY = (
 SCORE = (
     option(
         "SCENE",
-        "a folder that reconstruct wrote, one of such folders, named like the scans of --dtu, or a splat file",
+        "a folder that reconstruct wrote (with --dtu: one with such folders, named like the scans), or a splat file",
         Path,
     ),
     either(
@@ -229,7 +231,7 @@ SCORE = (
             "a log, a capture, or an image folder's TOML; logs of one session are read as one",
             Path,
         ),
-        option("--dtu ROOT", "a DTU data set in MVSNet's layout, or in IDR's and NeuS's", Path),
+        option("--dtu ROOT", "a DTU data set in the layout of MVSNet, or of IDR and NeuS", Path),
         required=True,
     ),
     *output("folder for scores and pictures", default="none, the scores are only printed"),
@@ -433,13 +435,13 @@ AUDIT = (
     ),
     option("--spheres FILE.yaml", "its spheres (default: the URDF's own, else fitted into the output)", Path),
     either(
-        option(f"--goal {POSE}", "audit a closed loop to this pose in world as well", pose),
+        option(f"--goal {POSE}", "also audit a closed loop to this pose, in world", pose),
         option("--goal-joints Q1,Q2,...", "or to this configuration [rad]", numbers),
     ),
     option("--frame LINK", "the link that a goal is of (default: the last of the URDF)"),
     option("-o/--out PATH", "folder of the steps and report.html; steps done there are kept (default: audit)", Path),
     option("--force", "repeat every step"),
-    option("--resume", "continue an interrupted reconstruction, to the same bytes"),
+    option("--resume", "continue an interrupted reconstruction; the result has the same bytes"),
     *CONFIG,
     DEVICE,
     *SOURCE,

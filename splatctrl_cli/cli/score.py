@@ -38,8 +38,8 @@ FORMS = {  # by the start of a figure's name: factor and format
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    first, *beside = args.reference or [None]
-    recording = recording_of(args, first, tuple(beside))
+    first, *others = args.reference or [None]
+    recording = recording_of(args, first, tuple(others))
     result = score(request_of(ScoreRequest, args, recording=recording, cloud=_cloud(args)), console)
     return console.show(result, lines_of(result.document))
 

@@ -1,4 +1,4 @@
-"""Numbers of the method by section of the paper. The paper's value is the default where it gives one."""
+"""Settings by section of the paper. Defaults are the paper's where it gives one."""
 
 from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config
 from splatctrl_cli.config.sections import (

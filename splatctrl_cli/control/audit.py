@@ -152,7 +152,7 @@ def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> 
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Yield ranges of at most CHUNK successive states in one scene; hold two scenes or fewer."""
+    """Yield ranges of at most CHUNK states in one scene; keep at most two scenes."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))

@@ -47,9 +47,9 @@ class SceneRows(BarrierTerm):
         return other
 
     def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """Distances (M,) [m]; `chosen` (M,) spheres have at least their link's surface gap.
+        """Distances (M,) [m], for `chosen` (M,) spheres raised to their link's surface gap.
 
-        Where that gap is larger, rows G (M, J) become its rows, in place.
+        Rows G (M, J) of raised spheres are replaced by the gap's, in place.
         """
         if self._balls is None or not chosen.any():
             return distance
@@ -117,7 +117,7 @@ class SelfRows(BarrierTerm):
     kind = RowKind.SELF
 
     def __init__(self, model: RobotModel, config: ControlConfig, acceleration: Float64 | None) -> None:
-        """acceleration as for `SceneRows`."""
+        """acceleration: as for `SceneRows`."""
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)

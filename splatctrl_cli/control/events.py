@@ -103,7 +103,9 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """Source of events of one kind: is_on (T,), value (T,); who (T,): a name, or names, the value's own first."""
+    """Source of events of one kind, by state: is_on (T,), value (T,), who (T,).
+
+    who: a name, or names, the value's own first."""
 
     kind: EventKind
     is_on: Bool

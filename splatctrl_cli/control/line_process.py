@@ -93,7 +93,7 @@ class LineProcess:
         self._kill()
 
     def _has_left(self, seconds: float) -> bool:
-        """True if it ends by itself in time. It is not reaped: its number stays reserved."""
+        """True if it ends in time. It is not reaped: its number stays reserved."""
         deadline, how = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
         while self._process.returncode is None and os.waitid(os.P_PID, self._process.pid, how) is None:
             if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""Conditions for running a controller; violations that none can change, and obstacles that approach fixed links."""
+"""Conditions for running a controller; violations outside its control, such as approaching obstacles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -147,7 +147,7 @@ class FixedParts:
         self._stood = self._new = np.zeros((0, 3))  # of the first scene; arrivals in the last one
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
-        self.found: dict[str, tuple[float, float]] = {}
+        self.clearances: dict[str, tuple[float, float]] = {}
 
     def look(self, distance_to: DistanceFunction, q: Float64, was_free: WasFree | None) -> None:
         """Add the next scene, at q (J,); was_free: None if unknown."""
@@ -155,10 +155,10 @@ class FixedParts:
             return
         centers = np.ascontiguousarray(self._model.sphere_centers(q)[self._still])
         own = distance_to(centers) - self._model.sphere_set.radii[self._still]
-        is_first = not self.found
+        is_first = not self.clearances
         if is_first:
-            self.found = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
-        first = np.array([self.found[name][0] for name in self._names])
+            self.clearances = {name: (float(mine), float(mine)) for name, mine in zip(self._names, own, strict=True)}
+        first = np.array([self.clearances[name][0] for name in self._names])
         change = np.where(first < self._near, fixed.MOUNTED_CHANGE, fixed.STATIC_CHANGE)
         came = own
         if isinstance(distance_to, BallDistance):
@@ -166,8 +166,8 @@ class FixedParts:
                 self._stood = np.asarray(distance_to.centers, np.float64)
             came = self._came(distance_to, centers, q, was_free, change)
         for name, value in zip(self._names, np.where(came < first - change, came, np.inf).tolist(), strict=True):
-            before, least = self.found[name]
-            self.found[name] = (before, min(least, value))
+            before, least = self.clearances[name]
+            self.clearances[name] = (before, min(least, value))
 
     def _came(
         self, balls: BallDistance, centers: Float64, q: Float64, was_free: WasFree | None, change: Float64

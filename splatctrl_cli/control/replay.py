@@ -1,4 +1,4 @@
-"""Open loop along a log, and closed loop from a logged start to a goal, in the scene known then."""
+"""Open loop along a log, closed loop to a goal, in the scene known then."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -289,7 +289,7 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
 class OpenLoopTask:
     """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad]: the posture to lean to with a goal pose (None: the model's `middle`).
+    home (J,) [rad]: the preferred posture with a goal pose (None: the model's `middle`).
     """
 
     frame: str

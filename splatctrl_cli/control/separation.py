@@ -107,7 +107,7 @@ class StopRow:
 
 @dataclass(frozen=True, kw_only=True)
 class StopTable:
-    """Declared stops by joint, each with its rows by rising extension; the next larger extension counts.
+    """Declared stops by joint, rows by rising extension; the next larger extension counts.
 
     A sphere's travel adds those of all axes, each on its circle: their stops need not keep the path.
     """
@@ -157,7 +157,7 @@ class Approach:
         )
 
     def speed_scale(self, motion: ArmMotion, room: Float64) -> Float64:
-        """Largest scales (T,) at which no sphere travels more than its room (T, M) [m]; 0 if even at rest."""
+        """Largest scales (T,) at which no sphere travels more than its room (T, M) [m]; else 0."""
         kept = np.zeros(len(room))
         for step in (1.0, *(0.5**k for k in range(1, SCALE_STEPS + 1))):
             tried = np.minimum(kept + step, 1.0)

@@ -39,7 +39,7 @@ STOP_KEYS = ("axis", "extension", "payload", "speed", "time", "distance")
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredSeparation:
-    """The keys of the file, None for a value to be measured or assumed; stops: rows of the stop table."""
+    """The keys of the file, None where absent. stops: rows of the stop table."""
 
     intrusion: float
     who: str = ANYTHING
@@ -65,8 +65,9 @@ class DeclaredSeparation:
 
 
 def read_separation(path: Path, axes: Sequence[str]) -> DeclaredSeparation:
-    """Read the declared inputs; axes: the robot's joints, all of which a stop table must have.
+    """Read the declared inputs.
 
+    axes: the robot's joints; a stop table must have all.
     Raises InputError for a missing file; UsageError for other text than TOML, an unknown or missing key, a value out
     of range, or a stop table that is incomplete or falls with the speed.
     """

@@ -1,5 +1,6 @@
-"""Scores of rendered against recorded views, over all pixels and those seen in training, and conclusions from them.
+"""Scores of rendered against recorded views, and what follows from them.
 
+Over all pixels and those seen in training.
 A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
 """
 

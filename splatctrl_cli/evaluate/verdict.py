@@ -75,14 +75,14 @@ def passed_reason(sentence: str, value: float, threshold: float, unit: str, coun
 class Criterion(Generic[E]):
     """One criterion of a verdict.
 
-    find: its reasons, if it applies. asked: the documentation's words, by default the first paragraph of its
+    find: its reasons, if it applies. meaning: the documentation's words, by default the first paragraph of its
     docstring. broken: those on a violation.
     """
 
     name: str
     find: Callable[[E], Iterable[Reason]]
     broken: str
-    asked: str = ""
+    meaning: str = ""
 
     def reasons(self, found: E) -> Iterator[Reason]:
         return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
@@ -90,9 +90,9 @@ class Criterion(Generic[E]):
     @property
     def docs(self) -> str:
         """The table's row, its cells separated by |."""
-        words = self.asked or (inspect.getdoc(self.find) or "").split("\n\n")[0]
-        asked = " ".join(words.split()).removesuffix(".")
-        return f"{self.name} | {asked[0].lower()}{asked[1:]} | {self.broken}"
+        words = self.meaning or (inspect.getdoc(self.find) or "").split("\n\n")[0]
+        meaning = " ".join(words.split()).removesuffix(".")
+        return f"{self.name} | {meaning[0].lower()}{meaning[1:]} | {self.broken}"
 
 
 @dataclass(frozen=True, kw_only=True)

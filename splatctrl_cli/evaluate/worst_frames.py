@@ -137,7 +137,7 @@ def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
 
 
 def _ring(center: Float64, radius: float, intrinsics: Intrinsics, zoom: int) -> list[Int32]:
-    """Outline (49, 2) [px / 2^SHIFT] of a sphere, camera frame; none if it is around the camera or behind it."""
+    """Outline (49, 2) [px / 2^SHIFT] of a sphere; empty if it is around or behind the camera."""
     away = float(np.linalg.norm(center))
     if center[2] - radius <= NEAR:
         return []

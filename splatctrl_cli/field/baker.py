@@ -1,4 +1,4 @@
-"""The baker of a distance field, a few planes at a time, and the blocks that an edit of the splats changes."""
+"""Baking of a distance field by planes, and the blocks that edited splats change."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -231,7 +231,7 @@ class Changes:
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
     """Blocks where bakes of `before` and `after` can differ by a bit.
 
-    A block can differ where a splat of one set alone matters, by the bake's culling bounds, or weights differ.
+    A block can differ if a splat of only one set reaches it, by the bake's culling bounds, or if weights differ.
     """
     shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))
@@ -258,7 +258,7 @@ def counts_after(
 ) -> dict[str, int]:
     """Counts of kernel values in the whole grid after baking `mask`.
 
-    `old` bakes these blocks again, to subtract theirs from `counts`.
+    `old` bakes the same blocks again, so that their earlier counts can be subtracted from `counts`.
     """
     if not old.counts:
         return {}

@@ -62,7 +62,7 @@ class LogSumExpField(ABC):
 
     @abstractmethod
     def terms(self) -> LogSumExp:
-        """Its terms, laid out for the kernels."""
+        """The terms, laid out for the kernels."""
 
     @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
@@ -329,7 +329,7 @@ class CalibratedProbability:
         return self.of(sdf.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:
-        """Its meaning and numbers, for a header."""
+        """The meaning and numbers, for a header."""
         return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 

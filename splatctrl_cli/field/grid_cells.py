@@ -1,4 +1,4 @@
-"""A distance grid: layout, memory, what cameras saw in it, its distance field, and never-seen cells."""
+"""A distance grid: layout, memory, views of cameras, distance field, never-seen cells."""
 
 import math
 from collections.abc import Mapping

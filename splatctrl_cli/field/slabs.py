@@ -130,7 +130,7 @@ def field_header(
     has_occupancy: bool,
     num_unrepresented: int = 0,
 ) -> dict[str, object]:
-    """Header of `baker`'s bake of `chosen`: labelled `splats`, then `num_unrepresented` balls."""
+    """Header of a bake of `chosen`: splats with one of `labels`, then `num_unrepresented` balls."""
     config = baker.config
     header: dict[str, object] = {
         "format": "splatctrl distance grid",
@@ -262,7 +262,7 @@ class UnknownSpace:
         return treated
 
     def header(self) -> dict[str, object]:
-        """Its changes of a header."""
+        """The changes of a header."""
         return {
             **({"bound": BOUND} if self.policy == "obstacle" else {}),
             "unknown": self.policy,

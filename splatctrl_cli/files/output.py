@@ -63,9 +63,9 @@ class Parts:
         """Return the path. Raises InputError if the file is not as written."""
         if self.digests is None:
             return path
-        listed, what = self.digests.get(self._name(path)), f"{path}: not among the parts that were listed"
+        listed, what = self.digests.get(self._name(path)), f"{path}: expected a file that its run wrote, got none"
         digest = require(listed, what, remedy=self.remedy)
-        refuse_if(not path.is_file(), f"{path}: missing; it was listed", remedy=self.remedy)
+        refuse_if(not path.is_file(), f"{path}: missing, though its run wrote it", remedy=self.remedy)
         refuse_if(
             sha256(path) != digest, f"{path}: was changed after it was written (another sha256)", remedy=self.remedy
         )
@@ -86,7 +86,7 @@ def lock_output(partial: Path, *, is_folder: bool) -> Iterator[None]:
     The lock follows a rename, and ends with the process. Without flock(2) nothing is locked. Raises UsageError if
     another run has the lock.
     """
-    descriptor = _taken(partial, is_folder=is_folder)
+    descriptor = _acquire(partial, is_folder=is_folder)
     try:
         yield
     finally:
@@ -100,7 +100,7 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _taken(partial: Path, *, is_folder: bool) -> int:
+def _acquire(partial: Path, *, is_folder: bool) -> int:
     while True:
         if partial.is_symlink():
             partial.unlink(missing_ok=True)

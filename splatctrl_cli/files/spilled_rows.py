@@ -188,7 +188,7 @@ Table = Float64 | Rows
 
 
 def select(table: Table, index: Index | None = None, columns: Index | None = None) -> Table:
-    """Rows of an index (K,), and of columns, in their order; a file is not read."""
+    """Rows and columns by index, in its order; a file is not read yet."""
     if isinstance(table, Rows):
         return table.select(index, columns)
     rows = table if index is None else table[index]

@@ -74,7 +74,7 @@ def _jpeg_head(data: bytes) -> ImageHead | None:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start and end of a PNG's chunks; a cut one ends beyond the data."""
+    """Yield kind, start and end of a PNG's chunks; the end may exceed the data."""
     at, kind = len(PNG), b""
     while at + 12 <= len(data) and kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)

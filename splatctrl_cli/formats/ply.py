@@ -1,4 +1,4 @@
-"""PLY elements as tables, if the file has the promised bytes; points in PLY or CSV."""
+"""PLY elements as tables, if the file is complete; points in PLY or CSV."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence

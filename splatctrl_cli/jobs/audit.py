@@ -91,7 +91,10 @@ class _Steps:
     def make(
         self, name: str, file: str, write: Callable[[], object], words: Sequence[str] = (), **more: object
     ) -> None:
-        """Write `file`, unless it is there as the same inputs made it; words: the command line that does the same."""
+        """Write `file`, unless the same inputs made it already.
+
+        words: the equivalent command line.
+        """
         decides, path = json.dumps([self.inputs, more], sort_keys=True, default=str), self.folder / file
         key = hashlib.sha256(decides.encode()).hexdigest()
         if path.is_file() and self.done.get(name) == [key, sha256(path)]:

@@ -91,16 +91,18 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
                 error=NotEvaluableError,
             )
         cameras, moving = sorted({frame.camera for frame in frames}), moving_cameras(frames)
-        held = _choose_fixed(request, cameras, has_anchor=arm is not None or bool(moving))
+        anchors = _choose_fixed(request, cameras, has_anchor=arm is not None or bool(moving))
         begin = {camera: np.eye(4) for camera in cameras}
         if request.board is not None:
             by_stamp = {c: {f.stamp_ns: f.T_world_camera for f in frames if f.camera == c} for c in cameras}
-            begin = board_start(request.board, sightings, Rig(recorded=by_stamp, moving=moving, arm=arm, held=held))
+            begin = board_start(
+                request.board, sightings, Rig(recorded=by_stamp, moving=moving, arm=arm, anchors=anchors)
+            )
         frames = [replace(frame, T_world_camera=frame.T_world_camera @ begin[frame.camera]) for frame in frames]
         evidence = evidence_of(frames, arm)
         progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")
         start = Estimate(corrections={camera: np.eye(4) for camera in evidence.cameras})
-        solution = solved(evidence, start, held)
+        solution = solved(evidence, start, anchors)
         unknown = _find_unobserved(solution)
         if any(unknown.values()):
             if not request.allow_unobserved:
@@ -256,14 +258,14 @@ def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
 
 
 def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
-    told = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
+    listed = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
     remedy = (
         "put objects of different shapes where all cameras see them"
         + (", turn the moving camera about two axes" if evidence.moving else "")
         + (", or give --urdf of a robot in view" if evidence.arm is None else "")
     )
     return NotEvaluableError(
-        f"calibrate: the recording does not say all: not observed: {told}",
+        f"calibrate: the recording does not say all: not observed: {listed}",
         remedy=f"{remedy}; --allow-unobserved writes the rest, with these as recorded",
     )
 
@@ -296,7 +298,7 @@ def _calibration(
             sigma_depth=certainty.sigma_depth(camera),
             depth_noticed=tuple(map(float, solution.noticed.get(camera, (np.inf, np.inf)))),
             covariance=covariance,
-            held=tuple(name for name, of_cameras in found.items() if camera not in of_cameras),
+            as_recorded=tuple(name for name, of_cameras in found.items() if camera not in of_cameras),
             unobserved=unknown.get(camera, ()),
         )
     return Calibration(
@@ -304,7 +306,10 @@ def _calibration(
         world_frame=source.world_frame,
         digests=source.digests(),
         cameras=cameras,
-        held=(*((BASE,) if evidence.arm is not None else ()), *(f"camera {camera}" for camera in solution.fixed)),
+        as_recorded=(
+            *((BASE,) if evidence.arm is not None else ()),
+            *(f"camera {camera}" for camera in solution.fixed),
+        ),
         clock=float(estimate.clock) if solution.adjustment.unknowns.has_clock else None,
         sigma_clock=certainty.sigma_clock,
     )

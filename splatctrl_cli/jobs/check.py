@@ -90,7 +90,9 @@ def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) 
         file = logged_urdf(paths)
     if file is None:
         for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
-            refuse_if(getattr(options, name), f"--{option}: expected --urdf beside it", error=UsageError)
+            refuse_if(
+                getattr(options, name), f"--{option}: needs the robot", remedy="give --urdf as well", error=UsageError
+            )
         return None
     return options.posed(file, own_spheres(file))
 
@@ -113,10 +115,10 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
             remedy += ": is it the pose of another frame?"
             yield error("views-agreement", f"camera {both[0]}", text, remedy, value=value, unit="mm")
     if good:
-        text = f"where views see one surface their depths differ by {1e3 * max(good):.1f} mm (median of its pixels)"
+        text = f"depths of one surface differ by {1e3 * max(good):.1f} mm between views (median of its pixels)"
         if len(good) > 1:
             middle = 1e3 * statistics.median(good)
-            text = f"{text} in the worst of {len(good)} pairs of cameras or views of one, by {middle:.1f} mm in most"
+            text = f"{text} in the worst of {len(good)} pairs of views, and by {middle:.1f} mm in the median pair"
         yield note("agreement", "cameras", text, value=round(1e3 * max(good), 2), unit="mm")
 
 

@@ -93,12 +93,12 @@ def demo(request: DemoRequest, perform: Perform, progress: Progress = SILENT) ->
                 progress.log(f"\n$ splatctrl {shlex.join(shown)}")
                 with recorded_as(shown):
                     label = perform(words, folder)
-                mode = " --mode closed-loop" if "closed-loop" in words else ""
+                is_right = label in expected.split(" or ")
                 reasons.append(
                     Reason(
-                        criterion=words[0] + mode,
-                        outcome=Outcome.PASSED if label in expected.split(" or ") else Outcome.FAILED,
-                        sentence=f"expected '{expected}', got '{label}'",
+                        criterion=words[0] + (" --mode closed-loop" if "closed-loop" in words else ""),
+                        outcome=Outcome.PASSED if is_right else Outcome.FAILED,
+                        sentence=label if is_right else f"expected '{expected}', got '{label}'",
                         label="not as expected",
                     )
                 )

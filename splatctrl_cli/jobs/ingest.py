@@ -52,9 +52,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> Result:
     )
     robots = logged_descriptions(request.paths)
     if len(robots) > 1:
-        said = ", ".join(where for _, where, _ in robots)
+        places = ", ".join(where for _, where, _ in robots)
         progress.log(
-            f"warning: {len(robots)} robots are described, by {said}: none is stored; give --urdf to each command"
+            f"warning: {len(robots)} robots are described, by {places}: none is stored; give --urdf to each command"
         )
     progress.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
     inputs = dict(source.digests())

@@ -183,7 +183,10 @@ def _times(request: RenderSceneRequest, scene: SceneFolder, track: _Track) -> li
 def _images(
     request: RenderSceneRequest, scene: SceneFolder, lens: Intrinsics, track: _Track, times: Sequence[float]
 ) -> Iterator[UInt8]:
-    """Pictures (H, W, 3), RGB; of depth from red near by to blue at the first one's farthest, black without."""
+    """Pictures (H, W, 3), RGB; of depth from red (near) to blue (far).
+
+    The first picture's farthest depth is blue. No depth is black.
+    """
     splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))
     stamps, farthest = _stamps(scene), 0.0
     for time_s in times:

@@ -18,8 +18,9 @@ SPARE_PLACE = 1e15
 
 
 class Clusters(NamedTuple):
-    """Spheres in boxed clusters of 16; C is a multiple of 16, G of 8, spare ones far away.
+    """Spheres in boxed clusters of 16, and groups of clusters.
 
+    C is a multiple of 16, G of 8; spare ones are far away.
     centers (3, 16 C) [m]; boxes (6, C + G) [m], lower then upper corner, clusters then groups.
     """
 

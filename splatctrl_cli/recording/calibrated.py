@@ -91,7 +91,10 @@ class Correction:
         )
 
     def changed(self, stored: StoredFrame, T: Float64) -> StoredFrame:
-        """The frame with its depth corrected, at pose T (4, 4); counts stay counts if only their scale changes."""
+        """The frame with corrected depth, at pose T (4, 4).
+
+        Depth counts stay counts if only their scale changes.
+        """
         camera, unit = self.camera(stored.camera), stored.depth_unit
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return replace(stored, T_world_camera=T)
@@ -248,7 +251,7 @@ class Perturbation:
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> "Perturbation | None":
-        """Build from values by name; None if they do nothing. Raises UsageError for an unknown name or value."""
+        """Build from values by name, or None without effect. Raises UsageError for an unknown one."""
         for name, value in values.items():
             refuse_if(
                 name not in LIMITS,

@@ -106,7 +106,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
         if path.suffix == ".toml" or is_capture(path) or has_views(path):
             if len(paths) == 1:
                 return None
-            raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
+            raise InputError(f"{path}: expected a log, as several were given", remedy="give it alone")
     logs = tuple(open_log(path) for path in paths)
     return logs[0] if len(logs) == 1 else SessionLog(logs)
 

@@ -43,7 +43,7 @@ class Cut:
     voxel: float
 
     def of(self, grid: DistanceGrid, channel: str) -> Float64:
-        """The channel in the plane, rows upwards along the later axis."""
+        """The channel in the plane; rows run upwards along the second axis."""
         where: list[Any] = [slice(None, None, self.step)] * 3
         where[self.axis] = self.index
         return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1), np.float64)

@@ -222,7 +222,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
 
 
 def _counts(suites: Sequence[Suite]) -> dict[str, str]:
-    """Not evaluable counts as error: nothing was proven."""
+    """Count failures and errors. Not evaluable is an error: nothing was proven."""
     return {
         "tests": str(sum(len(suite.cases) for suite in suites)),
         "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),

@@ -117,7 +117,7 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
 def coarsen(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: int) -> tuple[Float32, float]:
     """Centres (K, 3) and edge [m] of at most `most` cubes on unknown space's border.
 
-    Larger cubes are unknown by half or more.
+    A cube of several cells is unknown if half of them are.
     """
     factor = 1
     while True:
@@ -253,7 +253,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as data URL, with size [px] and title; over: another one, to be drawn over it up to a border."""
+    """An image as data URL, with size [px] and title. over: a second one above it."""
 
     title: str
     data: str

@@ -29,13 +29,13 @@ PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 
 @dataclass(frozen=True, kw_only=True)
 class Deficit:
-    """Largest distance of a surface point outside all spheres: found <= truth <= proven [m].
+    """Largest distance of a surface point outside all spheres: lower <= truth <= proven [m].
 
-    Negative: all of the surface is inside. place (3,): of `found`.
+    Negative: all of the surface is inside. place (3,): of `lower`.
     """
 
     proven: float
-    found: float
+    lower: float
     place: Float64
 
 
@@ -178,7 +178,7 @@ def largest_deficit(
         is_done = (upper <= max(floor, best + tolerance if best > floor else floor)) | is_small
         proven = max(proven, float(upper[is_done].max(initial=-np.inf)))
         pending = _halves(pending[~is_done])
-    return Deficit(proven=max(proven, best), found=best, place=place)
+    return Deficit(proven=max(proven, best), lower=best, place=place)
 
 
 def uncovered_area(
@@ -262,7 +262,7 @@ def _measure_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
     proven = deficit.proven
     if part.ball is not None:
         proven = min(proven, float(np.min(np.linalg.norm(centers - part.ball[0], axis=1) + part.ball[1] - radii)))
-    return Deficit(proven=proven, found=min(proven, deficit.found - part.slack), place=deficit.place)
+    return Deficit(proven=proven, lower=min(proven, deficit.lower - part.slack), place=deficit.place)
 
 
 def _proven(link: LinkCoverage) -> float:

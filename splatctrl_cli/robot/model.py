@@ -244,7 +244,7 @@ class RobotModel:
     @property
     def locked_words(self) -> str:
         values = ", ".join(f"{name} = {value:g}" for name, value in self.locked.items())
-        return f"fingers that the log does not move are locked in their middle: {values}; --lock holds them elsewhere"
+        return f"fingers without logged states are locked halfway: {values}; --lock sets other values"
 
     @property
     def num_joints(self) -> int:

@@ -48,9 +48,10 @@ BLOCK = 3  # cells along an edge
 
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
-    """Up to `most` of M moments, in order, with the links farthest apart.
+    """Choose `most` of M moments or fewer, in order, with the links farthest apart.
 
-    Farthest-point sampling by places and ways in between. T_world_link: (M, L, 4, 4).
+    Farthest-point sampling by the distance between postures, plus a share of the path between them.
+    T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
     placed = _move(T_world_link, corners).reshape(len(T_world_link), -1, 3)
@@ -141,8 +142,9 @@ class _View:
 def _views(
     surface: RobotSurface, frames: Sequence[RgbdFrame], T_world_link: Float64, boxes: Float64, reach: float
 ) -> Iterator[_View]:
-    """Yield frames, compared with the rendered robot; unexplained points within `reach` of the boxes (V, L, 2, 3)
-    stay.
+    """Yield frames, compared with the rendered robot.
+
+    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
     """
     thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):

@@ -133,8 +133,8 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """Number (N,) of the interval in which each cell is robot, -1 for none.
 
-    Votes of robot cells around it decide. In the first, the whole recording, cells next to robot need fewer
-    configurations.
+    Votes of robot cells around the cell decide. In the first interval, which is the whole recording, cells next to
+    robot cells need fewer configurations.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])

@@ -1,6 +1,6 @@
-"""Splats for rendering only: the backdrop at pixels without depth, and the shell beyond the workspace.
+"""Splats for rendering only: at pixels without depth, and beyond the workspace.
 
-The shell is coarse, and has its own budget.
+The backdrop is of the former, the shell of the latter; the shell is coarse, and has its own budget.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ BLANK = 0.02  # share of a cell's pixels with depth
 
 
 def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], background: Color, most: int) -> Seeds:
-    """At most `most` seeds at pixels without depth that map and background leave unexplained.
+    """Place `most` seeds or fewer at pixels without depth that map and background leave unexplained.
 
     opacities: rendered (H, W). Cells of pixels become larger until the seeds are few enough.
     """

@@ -53,7 +53,10 @@ def unanswered_points(
 
 
 def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
-    """Pixels (H, W) without depth, in groups that meet neither the border, nor the robot, nor its stereo shadow."""
+    """Pixels (H, W) in groups without depth.
+
+    No group meets the border, the robot or its stereo shadow.
+    """
     is_blank = frame.depth <= 0
     if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return np.zeros_like(is_blank)

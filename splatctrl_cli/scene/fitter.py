@@ -238,7 +238,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Background: colour of pixels without depth; if no view has depth, of pixels that no splat covers."""
+        """Background: colour of pixels without depth, or without splats if no view has depth."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -274,7 +274,7 @@ class SceneFitter:
         removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
 
     def _strayed(self, robot: RobotPosture | None, seen: Seen) -> Bool:
-        """Object splats (M,) away from the robot that no pixel shows, in space that was never seen."""
+        """Object splats (M,) away from the robot, in no pixel, in space never seen."""
         is_strayed = np.zeros(len(self.buffer.centers), bool)
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config, np.inf)
         hidden = hidden[~self.occupancy.occupancy_around(self.buffer.centers[hidden])[1]]

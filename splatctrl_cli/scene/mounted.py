@@ -1,4 +1,4 @@
-"""Pixels of what is mounted on a moving camera, such as a gripper: neither seeded nor compared."""
+"""Pixels of parts on a moving camera, such as a gripper: neither seeded nor compared."""
 
 from collections.abc import Sequence
 

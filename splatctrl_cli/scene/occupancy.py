@@ -140,8 +140,9 @@ class OccupancyMap:
         self._hide_beside(arrived, math.ceil(len(self.edges) / max(len(seen), 1)))
 
     def _hide_beside(self, arrived: Index, num_steps: int) -> None:
-        """Forget views of space within `HIDDEN` of voxels (K,) of an arrived object, before the last `num_steps`
-        steps.
+        """Forget views of space within `HIDDEN` of voxels (K,) of an arrived object.
+
+        The last `num_steps` steps stay.
         """
         reach = math.ceil(fixed.HIDDEN / self.config.voxel)
         cells = np.stack(np.unravel_index(arrived, self.entity.shape), axis=1)

@@ -28,7 +28,7 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """Surface and poses (L, 4, 4) of its links at a stamp; without a surface, the spheres serve as one."""
+        """Surface, or else spheres, and poses (L, 4, 4) of its links at a stamp."""
         if self.surface is None:
             return RobotSurface.from_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]

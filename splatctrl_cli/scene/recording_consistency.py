@@ -103,7 +103,7 @@ class PoseJump:
 
 
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
-    """Longest move of a camera between successive frames at most a second apart; None without frames.
+    """Longest move of a camera between frames at most a second apart; None without frames.
 
     poses: stamp [ns], camera and T_world_camera, by stamp.
     """

@@ -20,9 +20,9 @@ REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain"
 def nearest_depth(
     frame: RgbdFrame, reach: float = fixed.NEAREST_REACH, is_robot: Bool | None = None
 ) -> tuple[Float32, Float32]:
-    """Least valid depth (H, W) [m] within `reach` [m] of each pixel, inf without any; the same of all but the robot.
+    """Least valid depth (H, W) [m] within `reach` [m] of each pixel, with and without the robot.
 
-    `reach` is at the median depth. Robot pixels then count only for themselves and neighbours.
+    inf: no depth. `reach` is at the median depth. Robot pixels then count for themselves and neighbours only.
     """
     is_valid = frame.depth > 0
     depth, valid = np.where(is_valid, frame.depth, np.float32(np.inf)), frame.depth[is_valid]
@@ -141,7 +141,7 @@ def find_redundant(
 
 
 def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> Index:
-    """At most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
+    """Choose `num_wanted` splats (N, 3) or fewer to evict for seeds (K, 3), farthest first.
 
     Each is at least EVICT_NEARER farther from the path than its seed.
     """
@@ -217,7 +217,7 @@ def use_idle(
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
-    """At most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
+    """Place `num_seeds` pixel-sized seeds or fewer on measured surfaces, drawn by squared colour error.
 
     The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
     """

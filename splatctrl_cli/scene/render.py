@@ -1,4 +1,4 @@
-"""Rendering of splats, eq. 1 to 3 of the paper, and of Gaussians; weights of the loss, eq. 4."""
+"""Rendering of splats (eq. 1 to 3 of the paper) and Gaussians; weights of the loss (eq. 4)."""
 
 import math
 from collections.abc import Sequence

@@ -143,7 +143,7 @@ def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
 
 
 def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
-    """Least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest exceed it."""
+    """Least tolerance (to 1 %) for at most `count` cubes; infinite if even the coarsest are more."""
     if len(levels[0].points) > count:
         return float("inf")
     low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6

@@ -1,4 +1,4 @@
-"""Depth of one surface: its mean over time, and its steps at the outline of a robot."""
+"""Depth of one surface: its mean over time; its steps at a robot's outline."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def steady_depth(
 
 
 def object_twice(frame: RgbdFrame, before: Before, is_steady: Bool) -> Bool:
-    """Steady pixels (H, W) that were object in the last image, too; all of them if the camera moved."""
+    """Steady pixels (H, W) that showed an object twice; all of them if the camera moved."""
     if before is None or not np.array_equal(before[0].T_world_camera, frame.T_world_camera):
         return is_steady
     return is_steady & before[1] if before[1].shape == is_steady.shape else is_steady

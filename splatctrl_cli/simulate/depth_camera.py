@@ -43,7 +43,7 @@ class StereoDepth:
     def applied(self, depth: Float32, rng: np.random.Generator, *, focal: float = 0.0) -> Float32:
         """Measured depth (H, W) [m] of exact `depth`, 0 = none.
 
-        focal [px]: the image's (0: the imagers').
+        focal [px]: of the depth image; 0: of the imagers.
         """
         imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
         scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers

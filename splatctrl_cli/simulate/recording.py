@@ -103,7 +103,7 @@ class Scene:
             tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third, options.visitor)]
         )
         return cls(
-            primitives=(*tabletop.furniture(), *tabletop.things(), *temporary),
+            primitives=(*tabletop.furniture(), *tabletop.objects(), *temporary),
             temporary=tuple(temporary),
             motion=motion,
             has_people=options.with_person,

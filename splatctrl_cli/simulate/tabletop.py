@@ -51,7 +51,7 @@ def furniture() -> list[Primitive]:
     ]
 
 
-def things() -> list[Primitive]:
+def objects() -> list[Primitive]:
     return [
         box(
             "crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), texture("stripes", 0.06, "ocean", 0), np.deg2rad(20.0)
@@ -154,7 +154,7 @@ def turntable_views() -> Iterator[RgbdFrame]:
         width=width,
         height=height,
     )
-    scene = furniture() + things()
+    scene = furniture() + objects()
     for number in range(NUM_VIEWS):
         angle = np.deg2rad(-90.0 + 70.0 * number / (NUM_VIEWS - 1))
         height_above = 0.52 if number % 2 == 0 else 0.68

@@ -34,7 +34,7 @@ RIG = Calibration(
             covariance=np.diag(np.arange(6) * 1e-7),
             unobserved=("translation along the table's normal",),
         ),
-        "wrist": CalibratedCamera(T=np.eye(4), recorded=None, held=("depth scale", "depth bias")),
+        "wrist": CalibratedCamera(T=np.eye(4), recorded=None, as_recorded=("depth scale", "depth bias")),
     },
     clock=-0.0123,
     sigma_clock=0.0004,

@@ -101,7 +101,7 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     views = [frame() for _ in range(4)]
     views[2].depth[:] = 0.0
     assert reconstruct_folder(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
-    assert "  note: depth: 1 frame has none, which seeds nothing" in capsys.readouterr().out
+    assert "  note: depth: 1 frame has no depth, and seeded no splats" in capsys.readouterr().out
     rows = audit(tmp_path / "scene")
     assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
     assert [len(row["blind"]) for row in rows] == [0, 0, 1, 0]
@@ -114,7 +114,7 @@ def test_frames_that_repeat_their_depth_are_left_out_and_counted(
     folder = write_folder(tmp_path / "in", [frame() for _ in range(4)], noise=0.0)
     assert reconstruct_folder(folder, tmp_path / "scene", "-q") == 0
     assert (
-        "  note: depth: camera cam0: 3 frames repeat the depth of the one before: left out" in capsys.readouterr().out
+        "  note: depth: camera cam0: left out 3 frames that repeat the depth before them" in capsys.readouterr().out
     )
     metrics = json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]
     assert (metrics["time_steps"], metrics["repeated_frames"]) == (1, {"cam0": 3})
@@ -126,7 +126,8 @@ def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys:
         view.depth[20, 10:14] = values
     assert reconstruct_folder(write_folder(tmp_path / "odd", odd), tmp_path / "a", "-q") == 0
     assert (
-        "  note: input: 4 pixels of depth NaN, infinite, negative or 65535: taken as none" in capsys.readouterr().out
+        "  note: input: 4 pixels of depth are NaN, infinite, negative or 65535: read as no return"
+        in capsys.readouterr().out
     )
     assert reconstruct_folder(write_folder(tmp_path / "plain", plain), tmp_path / "b", "-q") == 0
     assert "infinite" not in capsys.readouterr().out
@@ -183,10 +184,10 @@ def test_a_budget_too_small_for_the_first_frames_is_warned_about_with_one_that_i
     description = write_folder(tmp_path / "in", [frame()])
     assert reconstruct_folder(description, tmp_path / "small", "--max-splats", "100") == 0
     err = capsys.readouterr().err
-    assert "warning: a budget of 100 splats is too small for the first frames" in err
+    assert "warning: 100 splats are too few for the first frames" in err
     enough = err.split("--max-splats ")[1].split()[0]
     assert reconstruct_folder(description, tmp_path / "enough", "--max-splats", enough) == 0
-    assert "too small" not in capsys.readouterr().err
+    assert "too few" not in capsys.readouterr().err
 
 
 def test_colour_and_depth_of_different_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

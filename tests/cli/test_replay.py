@@ -149,8 +149,8 @@ def test_fingers_that_the_log_does_not_move_are_locked_with_a_note(
     assert desk.replay(*scene_of(desk, BALL)) == 0
     warned = [line for line in capsys.readouterr().err.splitlines() if "fingers" in line]
     assert warned == [
-        "warning: fingers that the log does not move are locked in their middle: left = 0.02, right = 0.02; --lock "
-        "holds them elsewhere"
+        "warning: fingers without logged states are locked halfway: left = 0.02, right = 0.02; "
+        "--lock sets other values"
     ]
     assert not {"q_left", "q_right"} & set(desk.rows()[0])
 

@@ -169,7 +169,7 @@ def looked(*scenes: DistanceFunction, arm: PlanarArm | None = None) -> dict[str,
     parts = FixedParts(arm or ThinArm(), 0.04)
     for scene in scenes:
         parts.look(scene, Q, everywhere)
-    return parts.found
+    return parts.clearances
 
 
 def beside(gap: float) -> DistanceFunction:
@@ -200,7 +200,7 @@ def test_what_is_seen_for_the_first_time_did_not_come_and_stands_there_from_then
     parts.look(beside(0.4), Q, None)
     for seen in (lambda places: places[:, 1] > 0.3, everywhere, everywhere):
         parts.look(after, Q, seen)
-    assert parts.found["base[0]"][1] == pytest.approx(0.4, abs=0.05)
+    assert parts.clearances["base[0]"][1] == pytest.approx(0.4, abs=0.05)
 
 
 def test_what_one_scene_alone_has_is_noise() -> None:

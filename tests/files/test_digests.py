@@ -46,7 +46,9 @@ def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> Non
     assert json.loads((scene / "run.json").read_text())["parts"].keys() == digests.keys()
     (scene / "other.ply").write_bytes(b"x")
     expect_refusal(
-        "other.ply: not among the parts", Parts.from_folder(scene / "other.ply").checked, scene / "other.ply"
+        "other.ply: expected a file that its run wrote",
+        Parts.from_folder(scene / "other.ply").checked,
+        scene / "other.ply",
     )
     for parts in (3, {"splats.ply": 3}):
         without_parts(scene, parts=parts)
@@ -76,7 +78,7 @@ def test_a_file_that_was_changed_or_removed_is_refused_by_name(
     expect_refusal(f"{name}: was changed after it was written.*; make it again", lambda: look(open_scene(scene)))
     if name != "splats.ply":  # without which it is no scene
         (scene / name).unlink()
-        expect_refusal(f"{name}: missing; it was listed", lambda: look(open_scene(scene)))
+        expect_refusal(f"{name}: missing, though its run wrote it", lambda: look(open_scene(scene)))
 
 
 def test_a_table_emptied_or_reversed_is_refused_in_an_old_scene_too_where_it_can_be(scene: Path) -> None:

@@ -138,7 +138,7 @@ def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
             assert abs(camera.bias - 0.01) < 2 * camera.sigma_depth[1] < 0.005
         else:
             assert camera.bias == 0.0
-            assert "depth bias" in camera.held
+            assert "depth bias" in camera.as_recorded
             assert camera.depth_noticed[1] < 0.01
         assert camera.scale == 1.0
     rows = [row for row in errors("", setup, found) if row.unknown in ("position", "rotation")]

@@ -314,7 +314,7 @@ class Round(Partial):
 
     def _scene(self, seed: int, options: RecordingOptions) -> Scene:
         scene = super()._scene(seed, options)
-        source = next(p for p in tabletop.things() if p.kind == self.thing)
+        source = next(p for p in tabletop.objects() if p.kind == self.thing)
         T = pose_at([*MIDDLE, source.T_world_shape[2, 3]])
         alone: tuple[Primitive, ...] = (scene.primitives[0], replace(source, T_world_shape=T), scene.primitives[-1])
         return replace(scene, primitives=alone)

@@ -92,7 +92,7 @@ def test_what_is_no_log_is_not_read_beside_one(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap")
     (tmp_path / "images.toml").write_text("")
     expect_refusal(
-        r"images.toml: expected a log beside others, got none", open_session, [log, tmp_path / "images.toml"]
+        r"images.toml: expected a log, as several were given", open_session, [log, tmp_path / "images.toml"]
     )
 
 

@@ -32,7 +32,7 @@ def samples(triangles: np.ndarray, count: int, seed: int) -> np.ndarray:
 def test_one_ball_in_a_cube_leaves_corners_by_a_known_distance_and_six_squares_less_discs() -> None:
     found = largest_deficit(CUBE, np.zeros((1, 3)), np.array([0.12]))
     expected = np.sqrt(3) * 0.1 - 0.12
-    assert found.found == pytest.approx(expected, abs=1e-12)
+    assert found.lower == pytest.approx(expected, abs=1e-12)
     assert expected <= found.proven <= expected + 1e-5
     np.testing.assert_allclose(np.abs(found.place), 0.1)
     area = 6 * (0.04 - np.pi * (0.12**2 - 0.1**2))
@@ -49,8 +49,8 @@ def test_no_dense_sample_and_no_climb_from_it_beats_the_proven_deficit(seed: int
     points = samples(CUBE, 3000, seed)
     value = phi(points, centers, radii)
     assert value.max() <= found.proven
-    assert found.proven - found.found <= 1e-5 + 1e-12
-    assert phi(found.place[None], centers, radii)[0] == pytest.approx(found.found, abs=1e-12)
+    assert found.proven - found.lower <= 1e-5 + 1e-12
+    assert phi(found.place[None], centers, radii)[0] == pytest.approx(found.lower, abs=1e-12)
     best = points[np.argsort(value)[-5:]]  # adversary: walk on the cube's faces from the best samples
     for step in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
         tried = best[:, None] + step * rng.normal(size=(5, 60, 3))
@@ -63,7 +63,7 @@ def test_no_dense_sample_and_no_climb_from_it_beats_the_proven_deficit(seed: int
             best,
         )
         assert phi(best, centers, radii).max() <= found.proven
-    assert phi(best, centers, radii).max() >= found.found - 0.02
+    assert phi(best, centers, radii).max() >= found.lower - 0.02
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,7 +79,7 @@ def test_bounds_on_the_uncovered_area_hold_a_dense_sample(seed: int) -> None:
 def test_a_hole_between_two_spheres_that_no_corner_sees_is_found() -> None:
     centers = np.array([[-0.06, 0, 0], [0.06, 0, 0]])
     sheet = np.array([[[-0.1, -0.02, 0], [0.1, -0.02, 0], [0, 0.03, 0]]])
-    assert largest_deficit(sheet, centers, np.array([0.0599, 0.0599])).found > 0
+    assert largest_deficit(sheet, centers, np.array([0.0599, 0.0599])).lower > 0
     assert max(phi(sheet[0], centers, np.array([0.0599, 0.0599]))[:2]) < 0
 
 

@@ -68,7 +68,7 @@ def test_fingers_are_locked_in_their_middle_and_what_mimics_them_follows(tmp_pat
     assert held.joint_names == ("shoulder", "wrist")
     assert held.locked == {"knuckle": 0.02, "other": -0.02, "tip": pytest.approx(0.11)}
     (said,) = held.doubts
-    assert said.startswith("fingers that the log does not move are locked in their middle: ")
+    assert said.startswith("fingers without logged states are locked halfway: ")
     assert "knuckle = 0.02" in said and "--lock" in said
     q = {"shoulder": 0.01, "wrist": 0.03, **held.locked}
     same = whole.sphere_centers(np.array([q[name] for name in whole.joint_names]))

@@ -185,7 +185,7 @@ def test_distance_along_a_motion_is_that_at_each_of_its_stamps() -> None:
     visitor = tabletop.visitor(int(stamps[5]), int(stamps[9]), (0.4, 0.2, 0.06))
     poses = np.stack([visitor.T_world_shape, pose_at([0.8, 0.0, 0.1])])
     moved = replace(visitor, from_ns=ALWAYS[0], track=Track(stamp_ns=stamps[[3, 12]], T_world_shape=poses))
-    primitives = [*tabletop.things(), visitor, moved]
+    primitives = [*tabletop.objects(), visitor, moved]
     expected = [distance_to(primitives, *at) for at in zip(points, stamps.tolist(), strict=True)]
     np.testing.assert_array_equal(distance_along(primitives, points, stamps), expected)
     assert np.isinf(distance_along([visitor], points, stamps)[[0, -1]]).all()

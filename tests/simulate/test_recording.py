@@ -64,7 +64,7 @@ def test_every_exact_depth_lies_on_a_surface_before_which_nothing_stands(
 
 
 def test_the_window_of_a_solid_loses_no_pixel(exact: Recording) -> None:
-    camera, scene = exact.cameras[0], tabletop.things()
+    camera, scene = exact.cameras[0], tabletop.objects()
     whole, apart = Renderer(camera, [*scene]).image([]), Renderer(camera, []).image(scene)
     np.testing.assert_array_equal(whole[0], apart[0])
     np.testing.assert_array_equal(whole[1], apart[1])
@@ -276,7 +276,7 @@ def test_a_person_walks_by_and_the_masks_show_where(robot: RobotModel) -> None:
 
 
 def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
-    few, many = (Renderer(exact.cameras[0], tabletop.things(), color_rays=num) for num in (0, 4))
+    few, many = (Renderer(exact.cameras[0], tabletop.objects(), color_rays=num) for num in (0, 4))
     moving = [tabletop.visitor(0, 1)]
     np.testing.assert_array_equal(few.image(moving)[1], many.image(moving)[1])
     np.testing.assert_array_equal(few.depth(moving), many.image(moving)[1])

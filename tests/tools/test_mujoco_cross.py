@@ -37,7 +37,7 @@ def as_solid(primitive: Primitive) -> Solid:
 
 
 def test_the_same_scene_has_the_same_depth_in_both(renderer: None) -> None:  # noqa: F811
-    primitives = [*tabletop.furniture(), *tabletop.things()]
+    primitives = [*tabletop.furniture(), *tabletop.objects()]
     T = look_at((1.15, -0.15, 0.95), (0.36, 0.0, 0.10))
     lens = Intrinsics(fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy, width=640, height=480)
     ours = render.Camera(name="camera", intrinsics=lens, T_world_camera=T, is_training=True)
@@ -64,7 +64,7 @@ def test_the_same_spheres_on_the_same_robot_have_the_same_clearance_in_both() ->
     model = RobotModel.from_urdf(robot.urdf, SphereSet(links=tuple(links), centers=centers, radii=radii))
     assert [*model.joint_names] == names
     q = rng.uniform(robot.description.low, robot.description.high, (12, 6))
-    primitives = tabletop.things()
+    primitives = tabletop.objects()
     expected = [distance_to(primitives, model.sphere_centers(row), 0) - radii for row in q]
     balls: dict[str, list[Piece]] = {}
     for link, center, radius in zip(links, centers, radii, strict=True):

@@ -94,10 +94,10 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 
 
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
-    """Write occupied cells: a splat may reach the cube, or sdf is not above 0.
+    """Write occupied cells: a splat may reach the cube, or sdf is at most 0.
 
-    A splat may if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. The sdf test includes NaN and unknown
-    obstacles. Raises InputError with neither bound nor hard.
+    A splat may reach it if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. NaN and unknown obstacles
+    count as sdf of at most 0. Raises InputError with neither bound nor hard.
     """
     shape = check_grid(grid)
     refuse_if(

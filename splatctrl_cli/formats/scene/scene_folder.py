@@ -59,7 +59,7 @@ class Snapshot:
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
-        """When voxels were last seen; None in an older scene."""
+        """Last views of the voxels; None in an older scene."""
         return self._read_voxels(read_seen)
 
     def unrepresented(self) -> Balls | None:
@@ -249,7 +249,7 @@ class SceneFolder:
         return read_known_occupancy(self._isotropic("occupancy.npz"))
 
     def seen(self) -> SeenVoxels | None:
-        """When voxels were last seen; None in an older scene."""
+        """Last views of the voxels; None in an older scene."""
         return read_seen(self._isotropic("occupancy.npz"))
 
     @cached_property

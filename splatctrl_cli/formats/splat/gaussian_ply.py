@@ -134,7 +134,7 @@ def _angles(a: Float32, b: Float32) -> Float64:
 class SplatFormat:
     """A splat file format, in its module's ``ENTRIES``.
 
-    `held`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
+    `reduce`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
     library. `docs`: rows in docs/artefacts.md, an empty line between: suffix | what it is | what it rounds to | what
     it cannot represent.
     """
@@ -144,7 +144,7 @@ class SplatFormat:
     suffix: str
     write: Callable[[Path, GaussianSet, Mapping[str, str]], None]
     read: Callable[[Path], tuple[GaussianSet, Comments]]
-    held: Callable[[GaussianSet], GaussianSet] = lambda gaussians: gaussians
+    reduce: Callable[[GaussianSet], GaussianSet] = lambda gaussians: gaussians
     bound: Callable[[GaussianSet], Differences] = float32_bound
     check: Callable[[], object] = lambda: None
     docs: str = ""
@@ -359,6 +359,6 @@ REFERENCE_PLY = replace(
     _PLY,
     name="3D-GS PLY, 62 properties",
     write=lambda path, gaussians, comments: write_gaussian_ply(path, drop_labels(gaussians), comments),
-    held=drop_labels,
+    reduce=drop_labels,
 )
 ENTRIES = (_PLY,)

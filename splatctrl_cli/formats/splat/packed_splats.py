@@ -46,7 +46,7 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
-    clipped = held_by_splat(gaussians)
+    clipped = reduce_to_splat(gaussians)
     rows["center"], rows["sigma"] = clipped.centers, clipped.scales
     rows["rgba"][:, :3] = np.rint(255.0 * (0.5 + SH_C0 * clipped.harmonics[:, 0].astype(np.float64)))
     rows["rgba"][:, 3] = np.rint(255.0 * clipped.opacities.astype(np.float64))
@@ -77,7 +77,7 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     return gaussians, {}
 
 
-def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
+def reduce_to_splat(gaussians: GaussianSet) -> GaussianSet:
     """Limit to degree-0 colours in 0 to 1, without labels."""
     limit = 0.5 / SH_C0
     return replace(drop_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
@@ -108,7 +108,7 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
     Raises InputError for an invalid value.
     """
     check_gaussians("Gaussians to write", gaussians)
-    clipped, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
+    clipped, bits = reduce_to_spz(gaussians), _fraction_bits(gaussians.centers)
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[clipped.harmonics.shape[1]]
     fixed = np.rint(np.ldexp(clipped.centers.astype(np.float64), bits)).astype("<i4")
     parts = [
@@ -145,7 +145,7 @@ def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     return gaussians, {}
 
 
-def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
+def reduce_to_spz(gaussians: GaussianSet) -> GaussianSet:
     """Clip to the format's ranges, without labels."""
     harmonics = np.clip(gaussians.harmonics, *HARMONICS)
     harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
@@ -304,7 +304,7 @@ ENTRIES = (
         suffix=".splat",
         write=write_splat,
         read=read_splat,
-        held=held_by_splat,
+        reduce=reduce_to_splat,
         bound=lambda _: SPLAT_BOUND,
         docs="""
 `.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
@@ -317,7 +317,7 @@ ENTRIES = (
         suffix=".spz",
         write=write_spz,
         read=read_spz,
-        held=held_by_spz,
+        reduce=reduce_to_spz,
         bound=spz_bound,
         docs="""
 `.spz` | version 3 (gzip); 2 to 4 are read | centre 0.12 mm (within 2 km), sigma 3.2 %, colour 0.0037, opacity

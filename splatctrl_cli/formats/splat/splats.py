@@ -121,7 +121,10 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """Read a PLY in metres and world; comments may omit both. Raises as `read_ply` and `check_world`."""
+    """Read a PLY in metres and world, also where comments omit both.
+
+    Raises as `read_ply` and `check_world`.
+    """
     splats, comments = read_ply(path)
     check_world(path, comments)
     return splats
@@ -212,7 +215,7 @@ def format_of(path: Path, error: type[SplatCtrlError] = UsageError) -> SplatForm
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
-    """Read any splat file and its comments; a SplatSet if all are round and of one colour each.
+    """Read any splat file and its comments, as a SplatSet if round and plain.
 
     Raises InputError if missing, truncated, unknown or invalid.
     """

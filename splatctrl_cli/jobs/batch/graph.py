@@ -89,7 +89,7 @@ def select_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
 
 
 def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[str]:
-    """Distinct columns of a table of nodes, given as (job, column), by job."""
+    """Distinct columns of a table of (job, column), in the order of the jobs."""
     job_of = {name: job for job, name in columns}
     return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 

@@ -95,7 +95,7 @@ class Ledger(AbstractContextManager["Ledger"]):
     """The ledger of batches in one folder; several processes may open it."""
 
     def __init__(self, folder: Path) -> None:
-        """Open the ledger. Raises InputError for a file that is no ledger, or a newer one."""
+        """Open the ledger. Raises InputError for another kind of file, or a newer ledger."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.path = folder, folder / NAME
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"

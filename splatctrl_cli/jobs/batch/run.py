@@ -1,4 +1,4 @@
-"""The scheduler of a batch: nodes run in graph order, in processes; unchanged results are kept."""
+"""The scheduler of a batch: nodes run in processes, in graph order; unchanged results stay."""
 
 import json
 import os
@@ -117,7 +117,7 @@ class Scheduler:
         return is_busy
 
     def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
-        """The run that stands for a node, kept or skipped; None if it is to run."""
+        """The earlier or skipped run that stands for a node; None if it must run."""
         key, folder = self.keys[node.name], self.ledger.folder
         lacking = [need for need in node.needs if not self.runs[need].stamp]
         if lacking:

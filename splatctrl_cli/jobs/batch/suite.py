@@ -27,8 +27,9 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One command of a suite. options: by long name; matrix: values by option, each combination a variant.
+    """One command of a suite.
 
+    options: by long name. matrix: values by option; each combination is a variant.
     expect: a verdict's label or outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
     """
 
@@ -186,8 +187,8 @@ def _find_files(folder: Path, where: str, pattern: object) -> list[Path]:
 def _check_names(recordings: Sequence[Recording]) -> list[Recording]:
     """Name the recordings by file, with the folders or ending that distinguish them."""
     files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
-    beside = Counter(map(_strip_ending, set(files)))
-    places = [path if beside[_strip_ending(path)] > 1 else _strip_ending(path) for path in files]
+    counts = Counter(map(_strip_ending, set(files)))
+    places = [path if counts[_strip_ending(path)] > 1 else _strip_ending(path) for path in files]
     # a common name gets the folder's in front
     own = [
         f"{p.parent.name}-{p.name}" if p.name in ("log", "capture", "recording", "data") else p.name for p in places

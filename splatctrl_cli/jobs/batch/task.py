@@ -56,7 +56,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The end of a run; exit_code is None if it was killed, or never completed, for `cause`.
+    """The end of a run. exit_code: None if `cause` killed or prevented it.
 
     started [s since 1970]. stamp: of the output, changes when rewritten.
     """
@@ -145,8 +145,8 @@ def last_lines(log: Path, number: int = 5) -> list[str]:
 
 def _start(entry: str) -> "subprocess.Popen[str]":
     words = [sys.executable, "-m", __name__, entry]
-    told = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
-    environment = {**told, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    inherited = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
+    environment = {**inherited, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     if VISIBLE not in environment and (cards := num_cards()) > 1:
         environment[CARD] = str(next(_numbers) % cards)
     pipe = subprocess.PIPE
@@ -237,7 +237,7 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
 
 def _wait(pid: int, task: Task) -> str:
     """Wait for the child, or end it and return why. Exits if stdin ends."""
-    start, asked, cause = time.monotonic(), 0.0, ""
+    start, interrupted, cause = time.monotonic(), 0.0, ""
     ended, look = os.pidfd_open(pid), 0.02 if task.memory else 1.0  # [s] between looks at a child's memory
     try:
         while True:
@@ -250,10 +250,10 @@ def _wait(pid: int, task: Task) -> str:
             if task.memory and _memory_of(pid) > task.memory:
                 _signal(pid, signal.SIGKILL)
                 cause = f"took more memory than {task.memory / 1e6:.0f} MB"
-            elif task.timeout and not asked and time.monotonic() - start > task.timeout:
+            elif task.timeout and not interrupted and time.monotonic() - start > task.timeout:
                 _signal(pid, signal.SIGINT)
-                asked, cause = time.monotonic(), f"timed out after {task.timeout:g} s"
-            elif asked and time.monotonic() - asked > 10.0:  # [s] from asking a child to end to ending it
+                interrupted, cause = time.monotonic(), f"timed out after {task.timeout:g} s"
+            elif interrupted and time.monotonic() - interrupted > 10.0:  # [s] from asking a child to end to ending it
                 _signal(pid, signal.SIGKILL)
     finally:
         os.close(ended)

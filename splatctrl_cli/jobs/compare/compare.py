@@ -75,7 +75,7 @@ class FigureChange:
             return f"{self.recording} had {self.before:.6g}{unit} and has no value any more"
         off = abs(self.after - self.before)
         words = f"{self.recording} went from {self.before:.6g} to {self.after:.6g}{unit}"
-        return f"{words}, {off:.3g} {self.change}, allowed {self.allowed:.3g}"
+        return f"{words} ({off:.3g} {self.change}, allowed {self.allowed:.3g})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +307,7 @@ def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
 def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: JudgedRuns) -> Iterator[Reason]:
     for one in verdicts:
         name = f"verdict of {one['run']}"
-        words = f"{one['run']}: the verdict went from '{one['before']}' to '{one['after']}'"
+        words = f"changed from '{one['before']}' to '{one['after']}'"
         if one["change"] is not Change.WORSE:
             better = ", an improvement" if one["change"] is Change.BETTER else ""
             yield note(criterion=name, sentence=words + better)

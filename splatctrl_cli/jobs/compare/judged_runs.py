@@ -85,7 +85,7 @@ class JudgedRuns:
 
 
 def read_judged(path: Path) -> JudgedRuns:
-    """Read the folder of a judging command, an audit's steps, or a batch. Raises InputError for others."""
+    """Read the folder of a judging command, audit or batch. Raises InputError for others."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
     refuse_if(

@@ -117,15 +117,15 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> Result:
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
         kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
-        back, said = _write_scene(partial, kind, chosen, kept)
+        back, written = _write_scene(partial, kind, chosen, kept)
         before, after = _gaussians(chosen), _gaussians(back)
-        held, bound = kind.held(before), kind.bound(before)
+        reduced, bound = kind.reduce(before), kind.bound(before)
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
-        found = _check_differences(out, held, after, bound, exact)
+        found = _check_differences(out, reduced, after, bound, exact)
         largest, psnr, covered = _check_look(out, kind, chosen, back)
         rounded = None if chosen is selected else _look(selected, chosen)[1]
-        origin, num_outside = comments.get(ORIGIN), _num_outside(before, held)
-        not_kept = (*_not_kept(chosen, back, held), *({ORIGIN} & comments.keys() - said.keys()))
+        origin, num_outside = comments.get(ORIGIN), _num_outside(before, reduced)
+        not_kept = (*_not_kept(chosen, back, reduced), *({ORIGIN} & comments.keys() - written.keys()))
         metrics = {
             "format": kind.name,
             "bytes": partial.stat().st_size,
@@ -192,8 +192,8 @@ def _write_scene(
         write_ply(partial, splats, comments)
         return read_ply(partial)
     kind.write(partial, _gaussians(splats), comments)
-    back, said = kind.read(partial)
-    return back if isinstance(splats, GaussianSet) else as_splats(back, str(partial)), said
+    back, written = kind.read(partial)
+    return back if isinstance(splats, GaussianSet) else as_splats(back, str(partial)), written
 
 
 def _gaussians(splats: Splats) -> GaussianSet:
@@ -201,14 +201,14 @@ def _gaussians(splats: Splats) -> GaussianSet:
 
 
 def _check_differences(
-    out: Path, held: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
+    out: Path, reduced: GaussianSet, back: GaussianSet, bound: Differences, exact: Float64
 ) -> Differences:
     refuse_if(
-        len(held) != len(back) or not np.array_equal(held.labels, back.labels),
-        f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels",
+        len(reduced) != len(back) or not np.array_equal(reduced.labels, back.labels),
+        f"{out}: differs from its source: {len(back)} of {len(reduced)} splats, or other labels",
         error=WriteError,
     )
-    found = differences(held, back, exact)
+    found = differences(reduced, back, exact)
     refuse_if(beyond := found.beyond(bound), f"{out}: differs from its source: {'; '.join(beyond)}", error=WriteError)
     return found
 
@@ -225,21 +225,21 @@ def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> t
     return largest, psnr, covered
 
 
-def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
+def _not_kept(source: Splats, back: Splats, reduced: GaussianSet) -> list[str]:
     lost = {
         "labels": (source.labels != back.labels).any(),
         "density": isinstance(source, SplatSet)
         and isinstance(back, SplatSet)
         and (source.density != back.density).any(),
         "view-dependent colour": isinstance(source, GaussianSet)
-        and held.harmonics.shape[1] < source.harmonics.shape[1],
+        and reduced.harmonics.shape[1] < source.harmonics.shape[1],
     }
     return [name for name, is_lost in lost.items() if is_lost]
 
 
-def _num_outside(source: GaussianSet, held: GaussianSet) -> int:
-    harmonics = source.harmonics[:, : held.harmonics.shape[1]]
-    is_outside = (held.harmonics != harmonics).any(axis=(1, 2)) | (held.scales != source.scales).any(axis=1)
+def _num_outside(source: GaussianSet, reduced: GaussianSet) -> int:
+    harmonics = source.harmonics[:, : reduced.harmonics.shape[1]]
+    is_outside = (reduced.harmonics != harmonics).any(axis=(1, 2)) | (reduced.scales != source.scales).any(axis=1)
     return int(np.count_nonzero(is_outside))
 
 
@@ -327,8 +327,8 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
         if event["source"] in SHOWN:
             level = "INFO" if event["kind"] in INTERVENTIONS else "WARNING"
             words = f"{event['kind']}{SHOWN[event['source']]}: {event['worst_name']}, worst {event['worst']:.4g}"
-            told = f"{words} {event['unit']} at {event['worst_s']:.2f} s, until {event['end_s']:.2f} s"
-            yield int(event["first_ns"]), 4, methodcaller("add_line", EVENTS, int(event["first_ns"]), level, told)
+            line = f"{words} {event['unit']} at {event['worst_s']:.2f} s, until {event['end_s']:.2f} s"
+            yield int(event["first_ns"]), 4, methodcaller("add_line", EVENTS, int(event["first_ns"]), level, line)
 
 
 def _space_parts(known: Sequence[tuple[int, Snapshot]]) -> Iterator[Later]:

@@ -63,25 +63,23 @@ class Corrections:
         depth = RecordedDepth.of(frames)
         if not self and (source.has_clock or has_robot or depth is None):
             return list(frames), {}
-        depth = require(
-            depth, f"{source.name}: {self.options}: no view has depth, which alone says what views have in common"
-        )
-        scale, told = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
+        depth = require(depth, f"{source.name}: {self.options}: expected views with depth, got none")
+        scale, report = depth.median / fixed.SCALE_DEPTH, dict[str, Any]()
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
         if self.poses:
             moved, poses = _correct_poses(moved, scale, has_robot, console)
-            told |= poses
+            report |= poses
             rows = [
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
                 for row, f in zip(rows, moved, strict=True)
             ]
         gains = _gains(moved, scale, console, is_requested=self.exposure)
         if gains is not None:
-            told["exposure_spread"] = float(np.abs(np.log(gains)).max())
+            report["exposure_spread"] = float(np.abs(np.log(gains)).max())
             rows = [row | {"gain": gain.tolist()} for row, gain in zip(rows, gains, strict=True)]
             moved = [exposed(frame, gain) for frame, gain in zip(moved, gains, strict=True)]
-        return moved, told | {"corrected_views": rows} if told else {}
+        return moved, report | {"corrected_views": rows} if report else {}
 
 
 def _correct_poses(
@@ -102,7 +100,7 @@ def _correct_poses(
         )
     else:
         console.log(
-            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no move betters it"
+            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no correction reduces it"
         )
     return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
         "pose_residual": found.after,
@@ -135,7 +133,7 @@ def _describe(bends: FoundBends, scale: float, apart: float, after: float, conso
             f" {depth:.2f} m: surfaces of two views are {1e3 * after:.2f} mm apart, {1e3 * apart:.2f} by poses alone"
         )
     if not rows and (bends.gains or bends.unlike):
-        console.log("depth: stays as recorded: no bend that one half of the views tells holds for the other")
+        console.log("depth: stays as recorded: the two halves of the views show different bends")
     return {"depth_bend": max((row["largest"] for row in rows.values()), default=0.0)} | (
         {"depth_bends": rows} if rows else {}
     )
@@ -155,7 +153,7 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_reque
 
 
 def _are_exposures(gains: Float64, frames: Sequence[RgbdFrame], scale: float) -> bool:
-    """True for gains that explain half of what parts of images differ by, unlike gloss and moving shadows."""
+    """True if gains explain half of the differences of parts, unlike gloss and shadows."""
     if (gains.max(axis=0) / gains.min(axis=0)).max() <= 1 + limits.EXPOSURE_RATIO:
         return False
     bands = band_ratios(frames, scale, np.ones(len(frames), np.bool_), limits.EXPOSURE_BANDS)

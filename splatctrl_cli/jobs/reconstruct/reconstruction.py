@@ -107,7 +107,7 @@ class Reconstruction:
         self.writer = SceneWriter(
             folder, {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}, checkpoint
         )
-        self._kept = KeptMaps(self.writer, self.config)
+        self._maps = KeptMaps(self.writer, self.config)
         self._fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
@@ -180,7 +180,9 @@ class Reconstruction:
         index, self.num_read = self.num_read, self.num_read + 1
         needs_depth = self.request.box is None and self.robot is None and self.cloud is None  # for the workspace
         if self._fitter is None and not step.has_depth and needs_depth:
-            console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
+            console.log(
+                f"time step {index} left out: it has no depth, and the workspace is not known yet; --box sets it"
+            )
             self._early = self._early or step
             return None
         for frame in step.frames:
@@ -200,8 +202,8 @@ class Reconstruction:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
             console.log(
-                "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
-                " leave views out, or reconstruct them in parts"
+                "warning: there are more views than one time step can fit: all seed splats, but only the last refine"
+                " them; leave views out, or reconstruct them in parts"
             )
         if not self.source.has_clock and not self.fitter.num_steps:
             what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
@@ -217,10 +219,10 @@ class Reconstruction:
         if self.fitter.num_steps == 1 and row.unmet:
             budget = self.config.scene.max_splats
             console.log(
-                f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
-                f" slot; --max-splats {budget + row.unmet} would hold them"
+                f"warning: {budget} splats are too few for the first frames: {row.unmet} seeds were dropped; give"
+                f" --max-splats {budget + row.unmet}"
             )
-        if self.source.has_clock and (self._kept.is_due(index, step.stamp_ns) or self._kept.shows_news(self.fitter)):
+        if self.source.has_clock and (self._maps.is_due(index, step.stamp_ns) or self._maps.shows_news(self.fitter)):
             self.snapshot(step.stamp_ns)
         return row
 
@@ -236,7 +238,7 @@ class Reconstruction:
             return False
         budget = min(1000 * math.ceil((1.25 * (least + row.unmet + row.evicted)) / 1000), fixed.MOST_GROWTH * least)
         self.config = self.config.derived(scene=self.config.scene.derived(max_splats=budget))
-        console.log(f"the first frames show more than {least} splats can represent: uses {budget}")
+        console.log(f"{least} splats are too few for the first frames: the budget is now {budget}")
         return True
 
     def _refine(self, fitter: SceneFitter, console: Progress) -> None:

@@ -77,18 +77,18 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
 
 
 def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
-    if held := metrics.get("poses", {}).get("held", []):
-        shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
-        yield note(criterion="poses", sentence=f"not put right, too far off or seen by no other view: {shown}")
+    if stayed := metrics.get("poses", {}).get("held", []):
+        shown = ", ".join(stayed[:3]) + (f" and {len(stayed) - 3} more" if len(stayed) > 3 else "")
+        yield note(criterion="poses", sentence=f"not corrected, as too far off or without a common surface: {shown}")
     for camera, bend in metrics.get("depth_bends", {}).items():
         yield note(
             criterion="depth",
-            sentence=f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth",
+            sentence=f"{camera}: corrected for a bend of at most {100 * bend['largest']:.1f} % of the depth",
         )
     if loss.invalid_depth:
         yield note(
             criterion="input",
-            sentence=f"{loss.invalid_depth} pixels of depth NaN, infinite, negative or 65535: taken as none",
+            sentence=f"{loss.invalid_depth} pixels of depth are NaN, infinite, negative or 65535: read as no return",
         )
     yield from (note(criterion="input", sentence=text) for text in loss.notes)
 
@@ -100,7 +100,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
     yield Reason(
         criterion="map",
         outcome=Outcome.NOT_EVALUABLE if is_empty else Outcome.PASSED,
-        sentence="it is empty: it has no splat of an object" if is_empty else f"{num_splats} splats of objects",
+        sentence="expected splats of objects, got none" if is_empty else f"{num_splats} splats of objects",
         value=float(num_splats),
         threshold=1.0,
         remedy="give a --box that holds what the cameras saw, and check the depth with 'splatctrl check'"
@@ -122,7 +122,7 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
 def _blind(made: Reconstructed) -> Iterator[Reason]:
     for camera, num in made.metrics["repeated_frames"].items():
         yield note(
-            criterion="depth", sentence=f"camera {camera}: {num} frames repeat the depth of the one before: left out"
+            criterion="depth", sentence=f"camera {camera}: left out {num} frames that repeat the depth before them"
         )
     without = made.metrics["frames_without_depth"]
     if made.is_seeded or not without:
@@ -133,7 +133,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
         start, end = made.seconds(first_ns), made.seconds(last_ns)
         yield note(
             criterion="depth",
-            sentence=f"camera {camera} returned none from {start:.2f} to {end:.2f} s",
+            sentence=f"camera {camera} returned no depth from {start:.2f} to {end:.2f} s",
             value=end - start,
             threshold=LONGEST_BLIND,
             unit="s",
@@ -144,7 +144,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
         )
     if not long:
         frames = "1 frame has" if without == 1 else f"{without} frames have"
-        yield note(criterion="depth", sentence=f"{frames} none, which seeds nothing")
+        yield note(criterion="depth", sentence=f"{frames} no depth, and seeded no splats")
 
 
 def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
@@ -179,11 +179,11 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
     cameras = made.metrics["displaced_cameras"]
     yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
-    told = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
-    if not told:
+    medians = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
+    if not medians:
         return
-    link = max(told, key=lambda name: abs(told[name]))
-    median, allowed = told[link], 1e3 * made.config.occupancy.self_mask_tolerance
+    link = max(medians, key=lambda name: abs(medians[name]))
+    median, allowed = medians[link], 1e3 * made.config.occupancy.self_mask_tolerance
     is_off = abs(median) > allowed
     side = "behind" if median > 0 else "before"
     yield Reason(
@@ -206,10 +206,10 @@ def _inside(made: Reconstructed) -> Iterator[Reason]:
     if num:
         yield note(
             criterion="points inside the robot",
-            sentence=f"{num} measured points lie inside it and are not explained by its surface, first in {link}",
+            sentence=f"{num} measured points, which its surface does not explain, first in {link}",
             value=float(num),
             time_s=made.seconds(made.metrics["inside_robot_first_ns"]),
             who=link,
-            remedy="contact, a carried object, or calibration: 'splatctrl check' measures the last",
+            remedy="look for contact, a carried object, or a wrong calibration ('splatctrl check')",
             count=num,
         )

@@ -28,7 +28,7 @@ class RecordingRequest:
     """A recording at `path`: log, capture, image folder, or DTU data set.
 
     scan: None for the only one. options: for a scan its holdout alone. protocol: of views. masks, depths: folders for
-    a scan. downscale: None for the protocol's size. beside: more logs of the session. Raises UsageError if `beside`
+    a scan. downscale: None for the protocol's size. others: more logs of the session. Raises UsageError if `others`
     is given with an image folder.
     """
 
@@ -40,12 +40,12 @@ class RecordingRequest:
     masks: Path | None = None
     depths: Path | None = None
     downscale: int | None = None
-    beside: tuple[Path, ...] = ()
+    others: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         refuse_if(
-            self.beside and is_folder_of_views(self.path),
-            f"--reference {self.path}: expected a log beside others, got images in a folder",
+            self.others and is_folder_of_views(self.path),
+            f"--reference {self.path}: expected a log, as the others are, got a folder of images",
             error=UsageError,
         )
 
@@ -108,8 +108,8 @@ def open_held_out(
     )
     refuse_if(
         recording.options.holdout,
-        "--holdout: the protocol says what is held out",
-        remedy="leave one of them out",
+        "--holdout: the protocol holds views out already",
+        remedy="give --holdout or --protocol, not both",
         error=UsageError,
     )
     options = replace(recording.options, cameras=None)

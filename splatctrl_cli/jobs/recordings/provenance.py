@@ -114,13 +114,13 @@ def scene_mismatches(
     """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
     if scene.parts.digests is None:
         yield lacking(
-            sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
+            sentence=f"{scene.path}: expected digests of its files, got none: an earlier version wrote it",
             remedy="reconstruct again",
         )
     yield from made_from_mismatches(scene.path, scene.made_from, source, model)
     if scene.has_clock and not scene.snapshots:
         yield lacking(
-            sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
+            sentence=f"{scene.path}: expected snapshots over time, got only the map of its end",
             remedy="reconstruct again",
         )
     if scene.has_clock and len(states):
@@ -242,8 +242,8 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Rea
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):
         return lacking(
-            sentence=f"{truth.path} is of another recording: none of its {len(truth.stamps)} stamps is in the log",
-            remedy="give the truth.json that simulate wrote beside the log",
+            sentence=f"{truth.path} is of another recording: the log has none of its {len(truth.stamps)} stamps",
+            remedy="give the truth.json that simulate wrote with the log",
         )
     if tuple(truth.joint_names) != tuple(model.joint_names) or not truth.robot_spheres.is_file():
         return None  # another model on purpose: nothing to compare with
@@ -259,7 +259,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Rea
     if worst <= fixed.SAME_CLEARANCE:
         return None
     return lacking(
-        sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "
-        "off those that it recorded",
-        remedy="give the truth.json that simulate wrote beside the log",
+        sentence=f"{truth.path} is of another recording: its clearances differ by up to {1e3 * worst:.0f} mm from "
+        "those of the logged motion",
+        remedy="give the truth.json that simulate wrote with the log",
     )

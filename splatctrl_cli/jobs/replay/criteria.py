@@ -82,7 +82,7 @@ class Bound:
 
     on: a column (T,) of the trace, of (T, K) the least of `parts`; or a function of the worst value. who: column of
     names. at_most, at_least: the allowed value, or where the input has it, and its `tolerance`. above: to be exceeded
-    (0: the margin). say, kept: sentences, without `kept` no passed reason. quantity, why: for the documentation.
+    (0: the margin). say, passed: sentences, without `passed` no passed reason. quantity, why: for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]
@@ -94,7 +94,7 @@ class Bound:
     tolerance: Number = 0.0
     unit: str = ""
     say: str
-    kept: str = ""
+    passed: str = ""
     remedy: str = ""
     outcome: Outcome = Outcome.NOT_EVALUABLE
     label: str = ""
@@ -125,8 +125,8 @@ class Bound:
                 remedy=self.remedy,
                 label=self.label,
             )
-        elif self.kept:
-            yield passed_reason(self.kept.format(**words), value, allowed, self.unit, found.count or 0)
+        elif self.passed:
+            yield passed_reason(self.passed.format(**words), value, allowed, self.unit, found.count or 0)
 
     def breaks(self, values: Any, allowed: float, tolerance: float = 0.0) -> Any:
         """True for values that are not allowed."""
@@ -169,8 +169,8 @@ class Bound:
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
-    """Every step of the closed loop is solved. Rows may be relaxed over twice their margin away. A user's controller
-    always answers validly.
+    """Every step of the closed loop is solved.
+    Rows may be relaxed only at over twice their margin. A user's controller always answers validly.
     """
     outside, trace, metrics = judged.replay.outside, judged.replay.closed_loop, judged.metrics
     if outside is not None:
@@ -200,7 +200,8 @@ def controller(judged: Judged) -> Iterator[Reason]:
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
     found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(
-        sentence=f"its rows could not be satisfied at {found} of {len(trace.steps)} steps, first",
+        sentence=f"constraints could not be satisfied at {sum(bad.values()):.0f} of {len(trace.steps)} steps "
+        f"({found}), first",
         value=float(sum(bad.values())),
         threshold=0.0,
         time_s=first.start_s,
@@ -215,7 +216,7 @@ def scene_hits(judged: Judged) -> Iterator[Reason]:
     """No obstacle appears inside the arm's surface; judged in closed loop."""
     if hits := [change for change in judged.replay.scene_changes if change.is_hit]:
         yield failed(
-            sentence=f"obstacles appeared inside the arm {len(hits)} times, first",
+            sentence=f"{plural(len(hits), 'obstacle')} appeared inside the arm, first",
             value=float(len(hits)),
             threshold=0.0,
             time_s=float(hits[0].stamp_ns - judged.replay.trace.stamp_ns[0]) * 1e-9,

@@ -65,15 +65,15 @@ def select_trained(steps: Iterable[TimeStep], every: int | None) -> Iterator[Tim
 
 
 def every_of(evidence: str | None) -> int | None:
-    """Parse k from ``--evidence k``, None for a camera. Raises UsageError if k leaves nothing to train on."""
+    """Parse k from ``--evidence k``, None for a camera. Raises UsageError for k below two."""
     try:
         every = int(evidence or "")
     except ValueError:
         return None
     if every < 2:
         raise UsageError(
-            f"--evidence {evidence}: expected a camera or every how many frame sets, at least 2",
-            remedy="every 4th, say, is left out of the training with --evidence 4",
+            f"--evidence {evidence}: expected a camera, or a number of frame sets from 2",
+            remedy="--evidence 4 leaves every 4th frame set out of the training",
         )
     return every
 
@@ -82,23 +82,23 @@ def check_evidence(request: ReplayRequest) -> None:
     """Raise UsageError for evidence that trained the map, if request or scene show it."""
     if request.evidence is None:
         return
-    every, asked = every_of(request.evidence), f"--evidence {request.evidence}"
+    every, option = every_of(request.evidence), f"--evidence {request.evidence}"
     if request.field is not None:
-        raise UsageError(f"{asked}: a baked field does not say which cameras made it", remedy="give --scene")
+        raise UsageError(f"{option}: a baked field does not say which cameras made it", remedy="give --scene")
     if request.lockstep:
         if every is None and request.evidence in (request.options.cameras or ()):
-            raise UsageError(f"{asked}: --cameras names it as a training camera", remedy="leave it out of --cameras")
+            raise UsageError(f"{option}: --cameras names it as a training camera", remedy="leave it out of --cameras")
         return
     assert request.scene is not None
     scene = open_scene(request.scene)
     if every is None and request.evidence in scene.cameras:
         raise UsageError(
-            f"{asked}: the camera trained {request.scene}",
+            f"{option}: the camera trained {request.scene}",
             remedy=f"name one that did not: any but {', '.join(scene.cameras)}",
         )
     if every is not None and scene.run.get("metrics", {}).get(EVERY) != every:
         raise UsageError(
-            f"{asked}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
+            f"{option}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
             remedy="name a camera that did not, or give --lockstep, which leaves these sets out",
         )
 

@@ -33,7 +33,7 @@ LIMITS = (
         on="unseen",
         at_most=UNSEEN,
         say="{percent:.0f} % of the space within the margin of the arm was never seen, allowed {allowed_percent:g} %",
-        kept="{percent:.0f} % of the space within the margin of the arm was never seen",
+        passed="{percent:.0f} % of the space within the margin of the arm was never seen",
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
@@ -42,18 +42,18 @@ LIMITS = (
         on="unseen_path",
         unit="m",
         above=UNSEEN_PATH,
-        say="a surface of the map is {mm} from the arm through unseen space, expected over {allowed_mm}: the object "
-        "may extend to the arm",
+        say="a surface of the map is {mm} from the arm through unseen space, expected over {allowed_mm} (the "
+        "object may extend to the arm)",
         remedy="add a camera that sees that side",
     ),
     Bound(
-        quantity="never seen, as nine tenths of the points about a sphere of the arm, from a surface of the map",
+        quantity="from a surface of the map to a sphere of the arm, nine tenths of the points about it never seen",
         why="space that is almost entirely unseen may hold a whole object",
         on="blind_to_surface",
         unit="m",
         above=BEYOND,
-        say="a part of the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed "
-        "{allowed_mm}: the surface may extend there",
+        say="the arm enters space that is over 90 % unseen, {mm} from a surface of the map, allowed {allowed_mm} "
+        "(the surface may extend there)",
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
@@ -62,7 +62,7 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.UNANSWERED,),
-        say="cameras got no depth from a place {mm} from the arm, margin {allowed_mm}",
+        say="no camera measured depth at a place {mm} from the arm, margin {allowed_mm}",
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
     Bound(
@@ -71,8 +71,8 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.CONTRADICTED,),
-        say="{mm} from the arm, margin {allowed_mm}, one camera measures depth behind a surface that another one "
-        "sees",
+        say="one camera measures depth behind a surface that another one sees, {mm} from the arm, margin "
+        "{allowed_mm}",
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
     Bound(
@@ -81,8 +81,9 @@ LIMITS = (
         on="class_distance",
         unit="m",
         parts=(EvidenceClass.DEPTH_EDGE,),
-        say="a depth edge was lost {mm} from the arm, margin {allowed_mm}: the surface may extend one pixel further",
-        remedy="keep farther from the edge, or add a camera that sees past it, or one with smaller pixels",
+        say="an edge without depth is {mm} from the arm, margin {allowed_mm} (the surface may extend one pixel "
+        "further)",
+        remedy="keep farther from the edge, or add a camera that sees past it or has smaller pixels",
     ),
     Bound(
         quantity="outside of the workspace, from the arm",
@@ -118,19 +119,25 @@ PROOF = Bound(
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Every class of evidence within the margin of the arm keeps its limit (listed below); at most `--max-unknown`
-    of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
+    """Every class of evidence within the margin of the arm keeps its limit (listed below).
+    At most `--max-unknown` of the sphere centres are in unobserved space. A baked field needs its channel `observed`.
     """
     first = BY_FEW.get(len(judged.inputs.scene.cameras or ()), LIMITS[0])
     for limit in (first, *LIMITS[1:]):
         yield from limit(judged)
     if (is_occupied := judged.request.unseen == OCCUPIED) or judged.request.require_proof:
         if np.isnan(judged.replay.trace["assumed"]).all():
-            yield lacking(sentence="evidence of the space near the arm is not recorded")
+            yield lacking(
+                sentence="expected evidence of the space near the arm, got none",
+                remedy="give a reconstruction as --scene",
+            )
         proof = replace(PROOF, outcome=Outcome.FAILED, label=MARGIN) if is_occupied else PROOF
         yield from proof(judged)
     if judged.metrics["unknown_share"] is None:
-        yield lacking(sentence="the space that cameras saw is not recorded")
+        yield lacking(
+            sentence="expected a record of the space that cameras saw, got none",
+            remedy="give a reconstruction as --scene, or bake with the channel observed",
+        )
     yield from UNKNOWN_SHARE(judged)
 
 
@@ -145,13 +152,13 @@ UNKNOWN_SHARE = Bound(
     on=_unknown_share,
     at_most=attrgetter("request.max_unknown"),
     say="{percent:.1f} % of the sphere centres lie in unseen space, allowed {allowed_percent:g} %, first",
-    kept="{percent:.2g} % of sphere centres in unseen space",
+    passed="{percent:.2g} % of sphere centres in unseen space",
     remedy="add a camera, or give a larger --max-unknown",
 )
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
-    """The surface clearance less the bound on the map's error is at least 0; judged with `--evidence`.
+    """The surface clearance is at least the bound on the map's error; judged with `--evidence`.
 
     With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
     criterion fails. The same holds for too little evidence.
@@ -161,10 +168,10 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
     if found is not None and found.bound is None:
         yield lacking(
-            sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
-            "surface near the motion, too few for two independent stretches",
+            sentence=f"not bounded: {found.num_seen} of {found.num_sets} held-out frame sets show surface near the "
+            "motion, too few for two independent stretches",
             who=found.source,
-            remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
+            remedy="judge a longer motion, name another camera, or raise verdict.evidence_reach",
             count=found.num_seen,
         )
     if found is None or found.bound is None or surface is None:  # no distance at any state: others report it
@@ -174,8 +181,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield passed_reason(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
     yield lacking(
-        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), but the motion keeps only "
-        f"{mm(surface)}; it missed most",
+        sentence=f"{bound_words(found.bound)}, but the clearance is only {mm(surface)}; largest miss",
         value=surface - value,
         threshold=0.0,
         unit="m",
@@ -183,21 +189,21 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         place=found.place,
         who=found.source,
         cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
-        remedy="a map that misses less needs more cameras, newer frames or a larger --max-splats",
+        remedy="for a smaller error, add cameras, or raise frame rate or --max-splats",
         count=found.num_points,
     )
 
 
 def bound_words(bound: ConformalBound) -> str:
     return (
-        f"map error at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
+        f"at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
         f"{bound.num_stretches} stretches of held-out depth"
     )
 
 
 def belonging(judged: Judged) -> Iterator[Reason]:
-    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
-    written; splats that agree with their occupancy grid.
+    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links.
+    Files are as written, and splats agree with their occupancy grid.
     """
     yield from judged.inputs.mismatches
 
@@ -214,7 +220,7 @@ def find_displaced(judged: Judged) -> tuple[str, float] | None:
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Each camera sees the robot, all cameras each link, within 5 mm of the joints."""
+    """Each camera sees the robot, and all cameras each link, within 5 mm of joints."""
     figures = judged.inputs.scene.figures()
     if (camera := find_displaced(judged)) is not None:
         yield lacking(
@@ -254,8 +260,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """Voxels are at most 25 mm, the size of an obstacle without a splat. The robot's mask reaches at most
-    the margin: an obstacle touching the robot may go unseen that far.
+    """Voxels are at most 25 mm, the size of an obstacle without a splat.
+    The robot's mask reaches at most the margin, as it may hide an obstacle that touches the robot.
     """
     yield from VOXEL(judged)
     yield from BLIND(judged)
@@ -273,7 +279,7 @@ VOXEL = Bound(
     on=lambda judged: lacking(sentence="", value=judged.inputs.scene.figures().get("voxel")),
     at_most=COARSE_VOXEL,
     unit="m",
-    say="the map has voxels of {mm}, allowed {allowed_mm} beside a robot",
+    say="the map has voxels of {mm}, allowed {allowed_mm} near a robot",
     remedy="reconstruct with --urdf, or with --set scene.scale=1",
 )
 BLIND = Bound(
@@ -297,7 +303,7 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="clocks",
         find=CLOCKS,
-        asked="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
+        meaning="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
         broken=UNKNOWN,
     ),
 )

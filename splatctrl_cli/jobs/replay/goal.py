@@ -56,8 +56,8 @@ POSE_COLUMNS = tuple(POSE.split(","))
 
 def check_goal(request: ReplayRequest) -> None:
     """Raise UsageError for an option the mode does not use."""
-    asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
-    modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)}
+    controlled, driven = ("open-loop", "closed-loop"), ("closed-loop",)
+    modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), controlled)}
     for option, wanted in modes.items():
         given = getattr(request, option)
         if given is not None and given is not False and request.mode not in wanted:
@@ -148,7 +148,7 @@ def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists without a controller, or a frame without twists."""
     if request.twist_topic is not None and request.mode == "audit":
         raise UsageError(
-            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit does not ask the controller"
+            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit uses no controller"
         )
     if request.twist_frame is not None and request.twist_topic is None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
@@ -228,7 +228,7 @@ def check_controller(request: ReplayRequest) -> None:
     if request.mode == "audit":
         raise UsageError(
             "--controller, --controller-command: expected --mode open-loop or closed-loop",
-            remedy="an audit does not ask a controller",
+            remedy="an audit uses no controller",
         )
     if is_policy_server(request.controller or ""):
         parse_address(request.controller or "")
@@ -262,7 +262,7 @@ def commander_of(
 
 
 def _connector(request: ReplayRequest, inputs: ReplayInputs) -> tuple[str, Connect]:
-    """Name of the user's controller, and what starts it. Raises InputError for a log without commands."""
+    """Name and factory of the user's controller. Raises InputError for a log without commands."""
     limit, source, states = request.controller_step_limit, inputs.source, inputs.states
     if request.controller == RECORDED:
         commands = require(

@@ -38,7 +38,7 @@ class NewerDepth:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
         self._waiting: list[tuple[int, Float64]] = []  # states whose own depth is not known yet
         self._last: tuple[int, Float64] | None = None
-        self.found: list[LaterDepth] = []
+        self.later: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
         """Add states (T,), (T, J) and their clearances (T,) [m] in the map known then."""
@@ -76,7 +76,7 @@ class NewerDepth:
         worst = int(clearance.argmin())
         depth_ns = self._scene.depth_ns(known_ns)
         if clearance[worst] < self._margin and depth_ns is not None:
-            self.found.append(
+            self.later.append(
                 LaterDepth(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
             )
 
@@ -89,7 +89,7 @@ class Hindsight:
         self._stamps: list[int] = []
         self._postures: list[Float64] = []
         self._seen_ns: int | None = None  # when most of the space about the arm was last seen
-        self.found: list[LaterDepth] = []
+        self.later: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64) -> None:
         """Add states (T,), (T, J) of the motion."""
@@ -135,7 +135,7 @@ class Hindsight:
         if not late:
             return
         worst = min(late, key=lambda k: after[k])
-        self.found.append(
+        self.later.append(
             LaterDepth(
                 since_ns=since_ns, depth_ns=until_ns, stamp_ns=self._stamps[worst], clearance=float(after[worst])
             )

@@ -77,7 +77,7 @@ class MeasuredRobot:
 
     model: RobotModel
     surfaces: SelfSurfaces | None
-    kept: tuple[KeptMargin, ...] = ()
+    pair_margins: tuple[KeptMargin, ...] = ()
 
 
 def measured_robot(
@@ -103,9 +103,9 @@ def measured_robot(
     if config.coverage == "margin":
         _check_bounded(model)
     kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
-    beside = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
+    fixtures = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
     model = apply_kept_margins(model, config.self_margin, kept)
-    return MeasuredRobot(model=model, surfaces=surfaces, kept=(*kept, *beside))
+    return MeasuredRobot(model=model, surfaces=surfaces, pair_margins=(*kept, *fixtures))
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
@@ -123,7 +123,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
         *(
             f"{' and '.join(pair.links)}: their spheres overlap in every posture sampled, and nothing tells whether "
             "they touch: fit finer spheres (splatctrl robot spheres), or leave the pair out (--srdf)"
-            for pair in robot.kept
+            for pair in robot.pair_margins
             if pair.margin is None and not pair.is_fixture
         ),
     ]
@@ -132,7 +132,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
     """Sentences on what the robot's spheres cover, by subject. by_surface: of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
-    if kept := [pair for pair in robot.kept if pair.margin is not None]:
+    if kept := [pair for pair in robot.pair_margins if pair.margin is not None]:
         words["self_margins"] = _self_margin_words(robot, kept, config)
     if by_surface:
         links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
@@ -317,7 +317,7 @@ def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> Cl
     states = logged.states
     if not motion.cameras or not logged.source.has_clock or not len(states):
         return None
-    asked = states.select(select_states(states.stamp_ns, motion))
-    centers = model.sphere_centers_batch(asked.position[: len(asked)])
+    selected = states.select(select_states(states.stamp_ns, motion))
+    centers = model.sphere_centers_batch(selected.position[: len(selected)])
     moving = model.moving_spheres
-    return estimate_clock_offset(asked, motion, (centers[:, moving], model.sphere_set.radii[moving]))
+    return estimate_clock_offset(selected, motion, (centers[:, moving], model.sphere_set.radii[moving]))

@@ -105,7 +105,7 @@ class KnownScene:
         return next((known for known in self.known_ns[later : later + 1] if known <= latest), None)
 
     def own_ns(self, stamp_ns: int) -> int:
-        """Stamp [ns] at which the depth of this time is the newest known; its own without times."""
+        """Stamp [ns] at which depth of this time is the newest known; `stamp_ns` without times."""
         if not self.known_ns:
             return stamp_ns
         newest = max(0, bisect_right(self.stamps_ns, stamp_ns) - 1)
@@ -129,9 +129,7 @@ def fields_at(
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(known_ns, stamp_ns) - 1
         if index < 0:
-            raise NotEvaluableError(
-                f"no scene is known at stamp {stamp_ns} ns", remedy="it was not seen yet; ask for a later time"
-            )
+            raise NotEvaluableError(f"no map is known yet at stamp {stamp_ns} ns", remedy="give a later time")
         return kept(key_of(index))
 
     return at

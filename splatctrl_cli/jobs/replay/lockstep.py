@@ -57,9 +57,9 @@ def check_lockstep(request: ReplayRequest) -> None:
     if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
     if request.real_time and not request.lockstep:
-        raise UsageError("--real-time: expected --lockstep: other maps are made already", remedy="leave it out")
+        raise UsageError("--real-time: expected --lockstep, as other maps exist already", remedy="leave it out")
     if not request.lockstep and request.device.startswith(CUDA):
-        raise UsageError(f"--device {request.device}: expected --lockstep: only a fit is worth a card", remedy=TO_CPU)
+        raise UsageError(f"--device {request.device}: expected --lockstep, as only a fit uses a GPU", remedy=TO_CPU)
 
 
 def choose_scene(
@@ -172,7 +172,7 @@ class Lockstep:
         self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
 
     def scene(self) -> KnownScene:
-        """Return the scene of a replay; takes frame sets up to the first map at once."""
+        """Return the scene of a replay; take frame sets up to the first map now."""
         while self._next is not None and (self._is_real_time or not self._stamps_ns):
             self._take()
         self._fitted.check_found()

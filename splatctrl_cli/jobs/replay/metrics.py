@@ -46,7 +46,7 @@ num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """One figure of a replay: its value, and the number of states, links or points behind it.
+    """One figure of a replay: its value, and its number of states, links or points.
 
     running: its value before the first state, and up to each (T,); None if not of states. column: of ``steps.csv``,
     if any shows it; pick: its row there: "least", "largest", or a word.

@@ -142,7 +142,7 @@ def _record(request: ReplayRequest, inputs: ReplayInputs) -> ReplayRecord:
         declared=inputs.declared,
         first_state_ns=int(inputs.states.stamp_ns[0]),
         surfaces=inputs.surfaces,
-        kept=inputs.kept,
+        pair_margins=inputs.pair_margins,
     )
 
 
@@ -189,9 +189,9 @@ def _finish(
         median_radius=inputs.scene.at(int(stamps[radius_of])).median_radius,
         static_violations=statics,
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
-        unwatched=tuple(record.hindsight.found),
-        overtaken=tuple(record.newer_depth.found),
-        statics=record.fixed_parts.found,
+        unwatched=tuple(record.hindsight.later),
+        overtaken=tuple(record.newer_depth.later),
+        statics=record.fixed_parts.clearances,
         closest=record.closest,
         events=record.events(),
     )

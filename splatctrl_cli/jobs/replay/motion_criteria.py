@@ -50,7 +50,8 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
     room, loss = exact - judged.threshold, exact - least
     voxel = judged.metrics.get("voxel") or 0.02
     yield lacking(
-        sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}",
+        sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}, "
+        f"margin {mm(judged.replay.margin)}",
         value=least,
         threshold=judged.replay.margin,
         unit="m",
@@ -86,8 +87,8 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     worst = min(events, key=lambda event: event.worst)
     if represented is not None:
         starved = lacking(
-            sentence=f"{worst.worst_name} is {mm(least)} from space that is occupied and has no splat (the splats "
-            f"are {mm(represented)} away), margin {mm(replay.margin)}",
+            sentence=f"{worst.worst_name} is {mm(least)} from occupied space without a splat, margin "
+            f"{mm(replay.margin)} (the nearest splat is {mm(represented)} away)",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -101,8 +102,8 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     link, why = unlearned_link(judged) or ("", "")
     if link and worst.worst_name.startswith(f"{link}["):
         part = lacking(
-            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is within it from the "
-            f"first state on and may be a part of {link}, which {why},",
+            sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is there from the first "
+            f"state on and may be a part of {link}, which {why},",
             value=least,
             threshold=replay.margin,
             unit="m",
@@ -151,9 +152,10 @@ def _locate(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links overlap. No moving link comes within the margin of a fixed one without joints, such as a table.
-    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap) unless
-    the recording was. By collision surfaces, or by spheres if these cannot be read.
+    """No two links overlap.
+    No moving link comes within the margin of a fixed one without joints, such as a table.
+    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap), or than
+    recorded. Gaps are of collision surfaces, or of spheres if these cannot be read.
     """
     trace = judged.replay.trace
     found = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
@@ -165,7 +167,7 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
             sentence=f"{found.who} overlap by {mm(-least)}",
             threshold=0.0,
             unit="m",
-            remedy="pairs that may touch are named by --srdf",
+            remedy="name pairs that may touch with --srdf",
             label=CONTACT,
         )
     elif np.isfinite(least):
@@ -189,7 +191,7 @@ def _check_fixture(judged: Judged) -> Reason | None:
         unit="m",
         who=" and ".join(pair.links),
         time_s=float(stamp - int(judged.replay.trace.stamp_ns[0])) * 1e-9,
-        remedy="pairs that may touch are named by --srdf",
+        remedy="name pairs that may touch with --srdf",
         count=judged.replay.num_states,
         label=MARGIN,
     )
@@ -222,8 +224,8 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within a fixed link's margin in two scenes in a row. New is 1 cm or more
-    (at its mount 3 cm) from all that stood there, in space that was free before; the old is a note.
+    """No new obstacle comes within a fixed link's margin in two scenes in a row.
+    New means 1 cm or more (3 cm at the mount) from earlier surfaces, in space that was free; others are a note.
     """
     broken = {
         name: (first, least)
@@ -233,7 +235,8 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])
         yield failed(
-            sentence=f"the scene is within {mm(least)} of {name}, which no joint moves ({mm(first)} at first)",
+            sentence=f"the scene is {mm(least)} from {name}, which no joint moves, margin {mm(judged.replay.margin)} "
+            f"({mm(first)} at first)",
             value=least,
             threshold=judged.replay.margin,
             unit="m",
@@ -251,7 +254,7 @@ POSITION = over_limit(
     tolerance=attrgetter("request.config.control.limit_tolerance"),
     unit="rad",
     say="{who} is {negated:.4f} rad or m outside its limits",
-    kept="at least {value:.3f} rad inside",
+    passed="at least {value:.3f} rad inside",
     remedy="check that the URDF is of this robot, and the units and wrapping of its joints",
 )
 VELOCITY, ACCELERATION = (
@@ -261,7 +264,7 @@ VELOCITY, ACCELERATION = (
         at_most=1.0,
         tolerance=LIMIT_EXCEEDED - 1.0,
         say="{who} reaches {value:.2f} times its limit",
-        kept="at most {value:.2f} of the limit",
+        passed="at most {value:.2f} of the limit",
         remedy="check the stamps and units of the states, and the URDF's limits",
     )
     for name in ("velocity", "acceleration")
@@ -280,12 +283,14 @@ def acceleration_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
-    """The spheres' clearance less what they leave uncovered keeps the margin; every moving link has a sphere."""
+    """The spheres' clearance, less the depth of surface outside them, keeps the margin.
+    Every moving link has a sphere.
+    """
     model = judged.replay.model
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
         yield lacking(
-            sentence=f"the share of the robot that its spheres cover is unknown: {model.coverage_unknown}",
+            sentence=f"the coverage of the robot by its spheres is unknown: {model.coverage_unknown}",
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
@@ -300,8 +305,8 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
         return
     if surface < judged.threshold:
         yield lacking(
-            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}: up to "
-            f"{mm(float(np.nanmax(deficit)))} of it lies outside them",
+            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}, margin "
+            f"{mm(judged.replay.margin)} (up to {mm(float(np.nanmax(deficit)))} of it lies outside them)",
             value=surface,
             threshold=judged.replay.margin,
             unit="m",
@@ -314,16 +319,18 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound by the spheres' lever arms keeps the margin; intervals with too low a bound are halved."""
+    """A lower bound (by the spheres' lever arms) keeps the margin; intervals that break it are halved."""
     model, trace = judged.replay.model, judged.replay.trace
     _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
         yield lacking(
-            sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene"
+            sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene, margin "
+            f"{mm(judged.replay.margin)}"
             if bool(trace["is_met"][int(np.nanargmin(trace["clearance_between"]))])
-            else f"the arm may have come within {mm(between)} between two states",
+            else f"between two states the arm may have come within {mm(between)} of the scene, margin "
+            f"{mm(judged.replay.margin)}",
             value=between,
             threshold=judged.replay.margin,
             unit="m",
@@ -334,8 +341,9 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
 
 
 def _body_clearance(judged: Judged) -> tuple[float, float | None, float | None]:
-    """Least clearance [m] of spheres, surface, and between states. The last two are None if unknown, or if the
-    spheres, then NaN, break the margin.
+    """Least clearance [m] of spheres, surface, and between states.
+
+    The last two are None if unknown, or if the spheres, then NaN, break the margin.
     """
     trace, field = judged.replay.trace, "certified" if "certified" in judged.replay.fields else "exact"
     spheres = lowest(trace[f"clearance_{field}"])  # as `surface` is
@@ -348,15 +356,13 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="clearance",
         find=clearance,
-        broken=f"{BROKEN}; {UNKNOWN} where only voxels that are occupied and have no splat break it (a starved map: "
-        "raise `--max-splats`), or an object is near from the first state on and may be a part of a link that hardly "
-        "moves",
+        broken=f"{BROKEN}; {UNKNOWN} if only occupied voxels without a splat break it (raise `--max-splats`), or if "
+        "an object near from the first state on may be part of a link that hardly moves",
     ),
     Criterion(
         name="certified clearance",
         find=certified_clearance,
-        broken=f"{UNKNOWN}: the grid is too coarse, and the largest voxel that would do; {BROKEN} where the "
-        "interpolated value breaks it too",
+        broken=f"{UNKNOWN}, with the largest voxel that suffices; {BROKEN} if the interpolated value breaks it too",
     ),
     Criterion(name="clearance of people", find=clearance_of_people, broken=BROKEN),
     Criterion(name="true clearance", find=true_clearance, broken=BROKEN),
@@ -365,7 +371,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="position limits",
         find=POSITION,
-        asked="joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise",
+        meaning="joints stay within the URDF's limits, with `control.limit_tolerance` for encoder noise",
         broken=BROKEN,
     ),
     Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),

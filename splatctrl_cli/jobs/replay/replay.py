@@ -184,7 +184,7 @@ def _read(
         mismatches=_mismatches(request, scene, logged, model),
         declared=declared,
         surfaces=robot.surfaces,
-        kept=robot.kept,
+        pair_margins=robot.pair_margins,
         separation=separation,
     )
     return inputs, logged, evidence, robot

@@ -92,7 +92,7 @@ class ReplayRequest(RobotOptions, RunOptions):
 class ReplayInputs:
     """All inputs of a replay; states in the model's joint order.
 
-    surfaces: of links, None if unreadable. kept: margins of pairs.
+    surfaces: of links, None if unreadable. pair_margins: lowered ones.
     """
 
     source: RecordSource
@@ -104,7 +104,7 @@ class ReplayInputs:
     mismatches: tuple[Reason, ...] = ()
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
-    kept: tuple[KeptMargin, ...] = ()
+    pair_margins: tuple[KeptMargin, ...] = ()
     separation: DeclaredSeparation | None = None
 
     def motion(self) -> LoggedMotion:

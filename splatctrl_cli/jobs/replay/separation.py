@@ -68,7 +68,7 @@ def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: R
 
 
 def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
-    """Who counts as a person, and v_h."""
+    """Definition of a person, and v_h."""
     is_assumed = declared.who == ANYTHING
     how = "every surface of the map counts" if is_assumed else f"surfaces that count: {declared.who}"
     yield SeparationInput(symbol="person", unit="", source=ASSUMED if is_assumed else DECLARED, how=how)
@@ -137,7 +137,7 @@ def _distance_inputs(declared: DeclaredSeparation, inputs: ReplayInputs, replay:
 
 
 def evidence_age(trace: Trace) -> Float64:
-    """Age (T,) [s] of the depth about the arm: the map's, plus how much older that depth was when last evaluated."""
+    """Age (T,) [s] of the depth about the arm: the map's, plus its lag when last evaluated."""
     of_map, of_arm = trace["map_age_s"], trace["evidence_age"]
     looked = np.flatnonzero(np.isfinite(of_arm))
     before = np.searchsorted(looked, np.arange(len(of_map)), side="right")
@@ -221,7 +221,7 @@ class _SeparationPass:
         )
 
     def _robot_error(self, robot: RobotModel, is_surface: Bool) -> Float64:
-        """Z_r (M,): a declared one, else the residual plus the surface outside of spheres that stand for a link."""
+        """Z_r (M,): declared, else the residual plus the surface outside of a link's spheres."""
         deficit = np.where(is_surface, 0.0, np.maximum(robot.sphere_deficit[self._moving], 0.0))
         if self._declared.robot_error is not None:
             return np.full(len(deficit), self._number["Z_r"])

@@ -86,7 +86,7 @@ class ReplayRecord:
         declared: Declarations | None = None,
         first_state_ns: int = 0,
         surfaces: SelfSurfaces | None = None,
-        kept: Sequence[KeptMargin] = (),
+        pair_margins: Sequence[KeptMargin] = (),
     ) -> None:
         """Start an empty record.
 
@@ -101,7 +101,7 @@ class ReplayRecord:
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self.fixed_parts = FixedParts(model, 2.0 * (self._margin - fixed.SLIGHTLY_UNDER))
         self._spheres = sphere_names(model.sphere_set)
-        self._surfaces, self._kept = surfaces, kept
+        self._surfaces, self._pair_margins = surfaces, pair_margins
         self._enough = max(config.control.self_margin, config.control.margin)
         self.closest: dict[KeptMargin, tuple[float, int]] = {}
         spheres = [f"{self._spheres[a]} and {self._spheres[b]}" for a, b in model.self_pairs()]
@@ -202,7 +202,7 @@ class ReplayRecord:
             gaps = surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)
             nearest = gaps.argmin(axis=1) if gaps.size else np.full(len(gaps), -1)
             part = replace(part, self_clearance=gaps.min(axis=1, initial=np.inf), self_pair=nearest)
-        for pair in self._kept:
+        for pair in self._pair_margins:
             number = None if surfaces is None else surfaces.number_of(pair.links)
             own = sphere_gaps(self._model, pair.links, part.position) if number is None else gaps[:, number]
             at = int(own.argmin())

@@ -13,8 +13,8 @@ from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Jud
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """Depth about the arm is at most `--max-map-age` old and not newer than the state. After half a second
-    without any, the next depth shows nothing where the arm was. A baked field has no times (a note).
+    """Depth near the arm is at most `--max-map-age` old and not newer than the state.
+    After half a second without any, the next depth shows nothing where the arm was. A baked field has no times.
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     for found in judged.replay.unwatched:
@@ -26,7 +26,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             threshold=margin,
             unit="m",
             time_s=when,
-            remedy="its time of arrival is unknown: cameras must give depth all the time",
+            remedy="its time of arrival is unknown: record depth without pauses",
             count=judged.replay.num_states,
         )
     yield from AHEAD(judged)
@@ -46,7 +46,7 @@ EVIDENCE_AGE = Bound(
     at_most=OLDEST,
     unit="s",
     say="the newest depth near the arm is {value:.2f} s old, allowed {allowed:g} s",
-    kept="depth from about the arm at most {value:.2f} s before",
+    passed="depth from about the arm at most {value:.2f} s before",
     remedy="frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
 )
 
@@ -83,21 +83,22 @@ MAP_AGE = Bound(
     on=_oldest_map,
     at_most=OLDEST,
     unit="s",
-    say="the map is up to {value:.2f} s old, allowed {allowed:g} s, {words}",
-    kept="at most {value:.2f} s",
-    remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
+    say="the map is up to {value:.2f} s old, allowed {allowed:g} s ({words})",
+    passed="at most {value:.2f} s",
+    remedy="record depth during the whole motion, or raise --max-map-age",
 )
 
 
 def map_age(judged: Judged) -> Iterator[Reason]:
-    """The map is at most `--max-map-age` old (a baked field: from its moment). Newer depth shows nothing within the
-    margin: of a state's own time that a late map (`--latency`) did not contain, or the next after the last state.
+    """The map is at most `--max-map-age` old (a baked field: from its moment).
+    Newer depth shows nothing within the margin. This depth is of a state's own time, missing in a late map
+    (`--latency`), or the next after the last state.
     """
     yield from _overtaken(judged)
     has_clock = judged.inputs.source.has_clock
     if np.isnan(judged.replay.trace["map_age_s"]).all() and judged.request.field is not None and has_clock:
         yield lacking(
-            sentence="the field does not say what time it shows",
+            sentence="the baked field has no time",
             remedy="give --scene, or bake a reconstruction instead of bare splats",
             count=judged.replay.num_states,
         )
@@ -133,8 +134,8 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap over `verdict.longest_interval` in which the arm could reach the margin within its velocity
-    limits. No state without a distance or dropped for its stamp (*judged states*). At most `verdict.lead_in` before
+    """No gap over `verdict.longest_interval` lets the arm reach the margin within its velocity limits.
+    No state lacks a distance or was dropped for its stamp (*judged states*). At most `verdict.lead_in` is before
     the first map.
     """
     config, replay = judged.request.config.verdict, judged.replay
@@ -201,7 +202,7 @@ CLOCKS = Bound(
     at_most=CLOCKS_APART,
     tolerance=attrgetter("logged.clock.uncertainty_s"),
     unit="s",
-    say="the cameras' clock is {ms:.0f} ms {words}",
-    kept="{ms:.0f} ms apart",
+    say="the cameras' clock is {ms:.0f} ms {words}, allowed {allowed:g} s",
+    passed="{ms:.0f} ms apart",
     remedy="synchronise the clocks, or shift one in the log",
 )

@@ -80,7 +80,9 @@ def _how(judged: Judged) -> str:
 
 def _notes(judged: Judged) -> Iterator[str]:
     found = judged.replay.map_error
-    yield "map error not measured" if found is None or found.bound is None else bound_words(found.bound)
+    yield (
+        "map error not measured" if found is None or found.bound is None else f"map error {bound_words(found.bound)}"
+    )
     if close := [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:

@@ -103,7 +103,7 @@ def write_page_of_runs(
 ) -> None:
     """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
 
-    views: pictures of a map. In 3-D are replays, or a map alone.
+    views: pictures of a map. The page shows replays in 3-D, or a map if there are none.
     """
     scenes, sections = dict[str, str](), list[RunSection]()
     for heading, run in runs.items():
@@ -159,16 +159,16 @@ def _page_of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Pr
         key=lambda job: (job.ran.state == DONE, not job.is_changed, job.ran.outcome in ("passed", ""), job.least),
     )
     replayed = {job.ran.recording for job in jobs if job.ran.command == REPLAY}
-    told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.ran.recording not in replayed)]
-    wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]
+    shown = [job for job in jobs if _is_shown(job, is_seen=request.all_scenes and job.ran.recording not in replayed)]
+    wanted = [job for job in shown if job.run is not None and job.run.command in WITH_SPACE]
     chosen = {job.ran.node for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
     scenes: dict[str, str] = {}
     sections = []
-    for number, job in enumerate(told, start=1):
-        progress.log(f"{number} of {len(told)}: {job.ran.node}")
+    for number, job in enumerate(shown, start=1):
+        progress.log(f"{number} of {len(shown)}: {job.ran.node}")
         sections.append(_section(request, batch, job, scenes, has_space=job.ran.node in chosen))
     unexpected = [job for job in jobs if job.ran.state != DONE]
-    linked = {job.ran.node for job in told}
+    linked = {job.ran.node for job in shown}
     versions = sorted({ran.version for ran in batch.runs if ran.version})
     recordings = len({ran.recording for ran in batch.runs})
     return Page(
@@ -208,8 +208,8 @@ def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
         damaged = dict.fromkeys(job.ran.recording for job in jobs if job.ran.damage)
         return f"all {count} jobs as expected" + (f"; {DAMAGE}: {', '.join(damaged)}" if damaged else "")
     ran = unexpected[0].ran
-    said = ran.sentence or ran.cause or ran.state
-    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {ran.node}: {said}"
+    sentence = ran.sentence or ran.cause or ran.state
+    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {ran.node}: {sentence}"
 
 
 def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
@@ -224,7 +224,7 @@ def _job(batch: BatchFolder, ran: Run, is_changed: bool) -> _Job:
     return _Job(ran=ran, run=run, why=why, is_changed=is_changed)
 
 
-def _is_told(job: _Job, *, is_seen: bool) -> bool:
+def _is_shown(job: _Job, *, is_seen: bool) -> bool:
     if is_seen and job.ran.command == "reconstruct" and job.run is not None:
         return True
     if job.ran.state in ("skipped", "to do"):  # without a run

@@ -50,7 +50,7 @@ class RobotOptions:
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
-    """Robot described by logs, None if none is. Raises InputError for several or an invalid one."""
+    """Robot described by logs, or None. Raises InputError for several or an invalid one."""
     found = logged_descriptions(paths)
     refuse_if(
         len(found) > 1,

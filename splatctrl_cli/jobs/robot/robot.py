@@ -98,7 +98,7 @@ def _figures(report: CoverageReport) -> dict[str, Any]:
             "uncovered_share": link.uncovered_share,
             "uncovered_bounds": [bound / link.area for bound in link.uncovered_bounds],
             "deficit": None if link.deficit is None else max(0.0, link.deficit.proven),
-            "deficit_found": None if link.deficit is None else max(0.0, link.deficit.found),
+            "deficit_found": None if link.deficit is None else max(0.0, link.deficit.lower),
             "place": None if link.deficit is None else link.deficit.place.tolist(),
             "protrusion": link.protrusion,
             "worst_sphere": link.worst_sphere,
@@ -190,7 +190,7 @@ def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, An
 
 
 def describe_robot(request: RobotRequest) -> tuple[RobotModel, dict[str, Any]]:
-    """Read a robot with its locked joints, by default with the URDF's own spheres; also as a document.
+    """Read a robot, and its document. By default the spheres are the URDF's own.
 
     Limits are in rad or m, velocities per second; meshes_not_found: sentences.
     """
@@ -248,8 +248,9 @@ def _verdict(
     require: Sequence[str],
     allowed: float,
 ) -> Verdict:
-    """Fail for surface more than `allowed` [m] outside the spheres, or a bare moving link; a gate on max_deficit
-    replaces that.
+    """Fail for surface more than `allowed` [m] outside the spheres, or a bare moving link.
+
+    A gate on max_deficit replaces that.
     """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)

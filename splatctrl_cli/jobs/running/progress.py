@@ -29,7 +29,7 @@ class Wait:
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total
-        self._told = time.monotonic()
+        self._reported = time.monotonic()
         self._first: tuple[float, int] | None = None  # time and number of the first steps, which take longer
         self._done = 0
 
@@ -46,9 +46,9 @@ class Wait:
         self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
             return  # of what comes after it
-        if now - self._told < 10.0:  # between two lines of one wait
+        if now - self._reported < 10.0:  # between two lines of one wait
             return
-        self._told, left = now, ""
+        self._reported, left = now, ""
         if self._total is not None and self._first is not None and done > self._first[1]:
             begun, before = self._first
             left = f", about {duration((now - begun) * (self._total - done) / (done - before))} left"

@@ -94,13 +94,13 @@ def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any])
     """Raise UsageError naming deciding values that differ from the interrupted run."""
     before, after = dict(_flat(run)), dict(_flat(now))
     differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    said = ", ".join(
+    changes = ", ".join(
         f"{n} was {_format_value(before.get(n))}, is {_format_value(after.get(n))}" for n in differing[:3]
     )
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     refuse_if(
         differing,
-        f"{folder}: --resume: the interrupted run differs: {said}{more}",
+        f"{folder}: --resume: the interrupted run differs: {changes}{more}",
         remedy="give the same options, or start over without --resume",
         error=UsageError,
     )

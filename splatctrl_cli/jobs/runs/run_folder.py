@@ -142,14 +142,14 @@ def open_run(path: Path) -> RunFolder:
     partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
     refuse_if(
         partial.exists() and (partial == path or not path.exists()),
-        f"{partial}: not whole: its run is still writing, or was interrupted",
+        f"{partial}: incomplete: its run is still writing, or was interrupted",
         remedy="wait for it, or run its command again",
     )
     refuse_if(not path.exists(), f"{path}: no such folder", remedy="give the folder that a command wrote with --out")
     file = path / "run.json"
     refuse_if(
         not file.is_file(),
-        f"{path}: no run: it has no run.json",
+        f"{path}: expected a run, got a folder without run.json",
         remedy="give a folder that a command wrote with --out",
     )
     run = read_object(file)

@@ -58,8 +58,8 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         return _dtu_reference(recording, progress)
     refuse_scan_options(recording)
     where = recording.path
-    if recording.beside:
-        return _session_reference((where, *recording.beside), replace(recording.options, cameras=None))
+    if recording.others:
+        return _session_reference((where, *recording.others), replace(recording.options, cameras=None))
     if recording.protocol is None:
         source = open_source(where, replace(recording.options, cameras=None), needs_depth=False)
         return Reference(where=where, source=source, has_depth=source.depth_fault is None)

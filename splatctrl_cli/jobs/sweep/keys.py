@@ -90,7 +90,7 @@ class Stage(Job):
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Commands of a run from the first that a key varies on, the replay last; options of keys fit the run."""
+    """Commands of a run from the first that a key changes to the replay."""
 
     stages: tuple[Stage, ...]
     keys: Mapping[str, Key]

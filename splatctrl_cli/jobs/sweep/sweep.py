@@ -130,7 +130,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
             error=UsageError,
         )
     chain, out = chain_of(run, keys, command_line), request.out.absolute()
-    asked = {
+    requested = {
         "run": run.path.absolute().name,
         "arguments": run.arguments,
         "inputs": dict(run.run.get("inputs", {})),
@@ -138,7 +138,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         "tolerance": request.tolerance,
     }
     check_can_be_written(out)
-    _check_same(out, asked)
+    _check_same(out, requested)
     runs = Runs(run=run, chain=chain, out=out, command_line=command_line)
     starts = {name: a for name, (a, _) in ranges.items()}
     runs.nodes_at(starts | {name: b for name, (_, b) in ranges.items()})  # refuses what an option does not take
@@ -149,7 +149,7 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
             ledger, command_line.entry, progress, workers=request.workers, dask=request.dask
         ) as runs.scheduler,
     ):
-        _write(out, asked, {})
+        _write(out, requested, {})
         start = runs.at([starts])[0]
         _check_judged(_words(starts), vars(start))
         refuse_if(
@@ -164,12 +164,12 @@ def sweep(request: SweepRequest, command_line: CommandLine, progress: Progress =
         result = SweepResult(
             out=request.out, before=run.verdict, flips=flips, least=least, num_runs=len(runs.nodes), num_new=num_new
         )
-        _write(out, asked, {"is_done": True, **result.as_dict()})
+        _write(out, requested, {"is_done": True, **result.as_dict()})
         write_batch(out, runs.suite(starts), [*runs.nodes.values()], ledger.latest(), runs.keys)
     return result
 
 
-def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
+def _check_same(out: Path, requested: Mapping[str, Any]) -> None:
     file = out / FILE
     if not file.is_file():
         refuse_if(
@@ -185,7 +185,7 @@ def _check_same(out: Path, asked: Mapping[str, Any]) -> None:
         remedy="give another --out",
     ):
         before = json.loads(file.read_text(encoding="utf-8"))["asked"]
-        differs = [key for key in asked if before.get(key) != asked[key]]
+        differs = [key for key in requested if before.get(key) != requested[key]]
     refuse_if(
         differs,
         f"{out}: was begun with other settings: {', '.join(differs)}",
@@ -357,6 +357,6 @@ def _vary_together(
     return LeastChange(length=float(f"{found.length:.6g}"), last=last, first=first)
 
 
-def _write(out: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    document = {"format": FORMAT, "version": VERSION, "is_done": False, "asked": asked, **found}
+def _write(out: Path, requested: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    document = {"format": FORMAT, "version": VERSION, "is_done": False, "asked": requested, **found}
     write_durably(out / FILE, lambda path: write_json(path, document))

@@ -108,7 +108,7 @@ class DeviceFit:
 
     def expect(self, sizes: Sequence[tuple[int, int]]) -> None:
         """Expect views of sizes (H, W). Raises OutOfMemory if they do not fit."""
-        self._asked = list(sizes)
+        self._expected = list(sizes)
         if self._needed(self.num_splats) > self._usable():
             raise self._too_large()
 
@@ -220,7 +220,7 @@ class DeviceFit:
 
     def _needed(self, num_splats: int) -> int:
         tiles = self.part_capacity / max(self.num_splats, 1)
-        return bytes_needed(num_splats, self._asked, self.list_capacity, tiles)
+        return bytes_needed(num_splats, self._expected, self.list_capacity, tiles)
 
     def _usable(self) -> int:
         return self.device.available() + sum(self._sizes.values()) + sum(self._images.values())
@@ -229,7 +229,7 @@ class DeviceFit:
         usable, fixed = self._usable(), self._needed(0)
         each = (self._needed(self.num_splats) - fixed) / max(self.num_splats, 1)
         most = min(int((usable - fixed) / each), self.num_splats // 2)
-        views = f" and {len(self._asked)} views" if self._asked else ""
+        views = f" and {len(self._expected)} views" if self._expected else ""
         return OutOfMemory(
             f"out of memory: {self.num_splats} splats{views} take {self._needed(self.num_splats) / 1e6:.0f} MB,"
             f" {usable / 1e6:.0f} MB are free",

@@ -93,7 +93,7 @@ def num_cards() -> int:
 
 
 def usable_card(index: int = 0) -> Card:
-    """Card of that number. Raises DeviceError, with a remedy, if the driver or the card is unusable."""
+    """Card of that number. Raises DeviceError if the driver or the card is unusable."""
     try:
         cuda: Any = ctypes.CDLL(LIBRARY)
     except OSError as error:

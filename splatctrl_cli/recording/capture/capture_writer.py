@@ -58,10 +58,10 @@ class Journal:
             self.path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
         with self.path.open("r+b") as stream:  # a killed run may leave half a line
             stream.truncate(sum(len(line) for line in stream if line.endswith(b"\n")))
-        self._kept = self.entries()
+        self._earlier = self.entries()
 
     def next_kept(self) -> Entry | None:
-        entry = next(self._kept, None)
+        entry = next(self._earlier, None)
         self.num_entries += entry is not None
         return entry
 
@@ -110,7 +110,7 @@ def write_capture(
     progress: Callable[[int], None] | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], int]:
-    """Write all of `source` into `folder`, empty or of an interrupted run. Same input, same bytes.
+    """Write all of `source` into `folder`, empty or of an interrupted run.
 
     JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
     or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's

@@ -34,7 +34,10 @@ Fields = Mapping[str, bytes]
 
 
 class Bag1Log(RawLog):
-    """One ROS 1 bag; its index is not needed: a cut or growing bag has none. Raises InputError without any record."""
+    """One ROS 1 bag, also without its index, which a truncated or growing bag lacks.
+
+    Raises InputError without any record.
+    """
 
     container = "ROS 1 bag"
 
@@ -113,7 +116,7 @@ class Bag1Log(RawLog):
         self.channels[number(fields, "conn")] = add_ros_type(topic)
 
     def records(self, damage: Damage) -> Iterator[Part]:
-        """Yield all records in order; only chunks, connections and messages have bodies. Losses go to `damage`."""
+        """Yield records in order. Only chunks, connections and messages have content; losses go to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
                 damage.add(f"{self.path.name}: is not a bag of format 2.0")
@@ -266,7 +269,7 @@ class Db3Log(RawLog):
         except (sqlite3.Error, ValueError) as error:
             remedy = "try 'ros2 bag reindex', or copy it again"
             if header[_FILE_FORMAT] == _WAL and not has_journal:
-                error = ValueError(f"{error}, and {self._journal.name} is not beside it")
+                error = ValueError(f"{error}, and {self._journal.name} is missing")
                 remedy = f"copy {self._journal.name} from where the bag was recorded: a stopped recorder leaves it"
             raise InputError(f"{path}: not a readable {self.container}: {error}", remedy=remedy) from None
 

@@ -43,7 +43,7 @@ class RawMessage:
 
 
 class Part(NamedTuple):
-    """A record of a file; attachments and unknown ones have no content. fields: a ROS 1 bag's."""
+    """A record of a file, some without content. fields: a ROS 1 bag's."""
 
     offset: int
     opcode: int
@@ -105,7 +105,7 @@ class RawLog:
 
 
 class JoinedLog(RawLog):
-    """Logs read in turn, messages changed; `note` is a fault of the whole, counted as damage."""
+    """Logs read in turn, messages changed; `note`, a fault of all, counts as damage."""
 
     def __init__(
         self,

@@ -191,7 +191,7 @@ def read_table(
     path: Path,
     name: str,
     *,
-    beside: Collection[str] = (),
+    others: Collection[str] = (),
     fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> T:
     """Read table [name] of a TOML file; `fill` adds keys left out.
@@ -199,7 +199,7 @@ def read_table(
     Raises as `read_description`.
     """
     content = _content(path)
-    _check_keys(content, {name, *beside}, str(path), "")
+    _check_keys(content, {name, *others}, str(path), "")
     if fill is not None and isinstance(content.get(name), dict):
         content[name] = fill(content[name])
     return require(_optional(kind, content, name, path), f"{path}: [{name}] is missing", remedy=_HELP)

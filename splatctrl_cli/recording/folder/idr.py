@@ -1,4 +1,4 @@
-"""DTU scans in the layout of IDR and NeuS, and scans of any layout as training and held-out records.
+"""DTU scans in the layout of IDR and NeuS; scans as training and held-out records.
 
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
 and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the I-th
@@ -241,15 +241,15 @@ class DtuSource:
         if protocol is not None:
             refuse_if(
                 holdout,
-                "--holdout: the protocol says what is held out",
-                remedy="leave one of them out",
+                "--holdout: the protocol holds views out already",
+                remedy="give --holdout or --protocol, not both",
                 error=UsageError,
             )
             self.split = protocol.split(numbers, f"{root}/{dtu_scan.name}")
         else:
             self.split = _held_out(numbers, frozenset(holdout), root)
-        self._held = set(self.split.scored) - set(self.split.training)
-        self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
+        self._held_out = set(self.split.scored) - set(self.split.training)
+        self.cameras: tuple[str, ...] = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held_out else (TRAINING_CAMERA,)
         is_left_out = self.layout == "MVSNet"
         notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in dtu_scan.without_depth]
         self.loss = LossReport(unpaired_color=len(notes), notes=notes)
@@ -283,7 +283,7 @@ class DtuSource:
                 continue
             yield RgbdFrame(
                 stamp_ns=number,
-                camera=HOLDOUT_CAMERA if number in self._held else TRAINING_CAMERA,
+                camera=HOLDOUT_CAMERA if number in self._held_out else TRAINING_CAMERA,
                 color=view.color,
                 depth=view.depth,
                 intrinsics=view.intrinsics,

@@ -138,8 +138,9 @@ def read_numbers(path: Path) -> list[float]:
 
 
 def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 | None]:
-    """A camera's T_world_camera (4, 4) at any stamp [ns], interpolated from poses by stamp [s, as text]; None where
-    unknown.
+    """A camera's T_world_camera (4, 4) at any stamp [ns], None where unknown.
+
+    It interpolates poses by stamp [s, as text].
     """
     tree, known, lost = TfTree(), list[int](), list[int]()
     for text, T in poses.items():

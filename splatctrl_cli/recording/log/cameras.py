@@ -283,7 +283,7 @@ def _named_unlike(survey: Survey) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Up to eight names, then how many more."""
+    """The first eight names, then the number of others."""
     shown = ", ".join(names[:8]) or "none"
     return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
 

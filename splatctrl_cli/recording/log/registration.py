@@ -103,7 +103,7 @@ class TfTree:
         static: bool,
         holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a time; one that `holds` is valid always while alone.
+        """Add T_parent_child at a stamp; one that `holds` is always valid while alone.
 
         A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
         valid from their stamps on, the first also before. All is noted. Raises ValueError if not rigid (a zero
@@ -245,7 +245,7 @@ class Lens:
 def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:
     """Warp depth (H', W') [m] of camera `own` into the colour camera `target`, (H, W) [m], 0 = none.
 
-    Each depth pixel covers its square's image, so finer colour pixels get no holes; the nearest wins.
+    Each depth pixel fills the image of its square, so that finer colour pixels get no holes; the nearest wins.
     """
     x, y, z = transform_points(T_color_depth, back_project(own, depth)[depth > 0]).T
     front = z > 0
@@ -329,9 +329,9 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
-    """A lens's corrections: none for a pinhole, whose mask is `valid`. Raises InputError for an impossible lens.
+    """A lens's corrections: none for a pinhole, whose mask is `valid`.
 
-    It keeps focal lengths; an equidistant lens's are shortened, up to `WIDEST_RAY`.
+    Raises InputError for an impossible lens. Focal lengths stay; an equidistant lens's shrink, up to `WIDEST_RAY`.
     """
     if not is_distorted(model, coefficients):
         return Lens(intrinsics=lens, valid=valid)

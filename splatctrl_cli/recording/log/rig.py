@@ -260,8 +260,8 @@ class _Builder:
         remedy = f"name the right CameraInfo with --camera{by_hand if calibration.cut else ''}"
         refuse_if(
             not calibration.is_possible,
-            f"{self._where}: topic {image_topic}: {info} says {calibration.cut}, which it is not inside of, for"
-            f" images of {size[0]}x{size[1]}",
+            f"{self._where}: topic {image_topic}: {info} says {calibration.cut}, which lies outside of images of"
+            f" {size[0]}x{size[1]}",
             remedy=remedy,
         )
         cut = f" ({calibration.cut})" if calibration.cut else ""

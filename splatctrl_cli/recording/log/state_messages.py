@@ -166,7 +166,7 @@ class JointStream(ColumnWriter):
         log_time_ns: Stamps = _NO_STAMPS,
         columns: Mapping[str, Iterable[Float64]] | None = None,
     ) -> None:
-        """Start with known states, columns of rows in blocks. Raises ValueError if they differ in length."""
+        """Start with known states, as columns in blocks. Raises ValueError for unequal lengths."""
         self.names = names
         self._stamps, self._log_times = array("q", stamp_ns.tolist()), array("q", log_time_ns.tolist())
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}

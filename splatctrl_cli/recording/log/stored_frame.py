@@ -57,7 +57,7 @@ class JointTopics:
 
 
 def merge_joints(loss: LossReport, joints: LossReport, at: int, *, sign: int = 1) -> LossReport:
-    """Add the joints' report to `loss`, its notes at index `at`; with sign -1, take it out."""
+    """Add the joints' report to `loss`, notes at index `at`; subtract with sign -1."""
     added, after = (joints.notes, at) if sign > 0 else ([], at + len(joints.notes))
     return loss.plus(joints, [*loss.notes[:at], *added, *loss.notes[after:]], sign=sign)
 

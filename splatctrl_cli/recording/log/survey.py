@@ -345,7 +345,7 @@ _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 
 def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
-    """Topic or node and text of a log's URDFs, each once, from first messages; reads only their topics."""
+    """Topic or node and text of a log's URDFs, each once, from first messages."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     of_events = {t.name for t in topics if t.type_name == EVENT} if topics else {f"/{NAME}", EVENTS}  # no index

@@ -191,7 +191,7 @@ class VideoFileLog(RawLog):
         self.path = path
         beside = require(
             next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None),
-            f"{path}: no stamps beside it",
+            f"{path}: expected a file of stamps next to it, got none",
             remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
             + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
         )

@@ -218,7 +218,7 @@ def _read_described(path: Path, name: str) -> LoggedTwists:
         f"{path}: expected a table [{TABLE}], got {name}",
         remedy=f"{_SEE}, and name it so",
     )
-    table = read_table(TwistsTable, path, TABLE, beside=("states",))
+    table = read_table(TwistsTable, path, TABLE, others=("states",))
     refuse_if(
         table.time_unit not in TIME_UNITS_NS or (len(table.linear), len(table.angular)) != (3, 3),
         f"{path}: {TABLE}: expected linear and angular of 3 columns and time_unit of {', '.join(TIME_UNITS_NS)}",

@@ -269,7 +269,7 @@ class StatesTable:
 def read_described_track(path: Path) -> tuple[RawTrack, Path]:
     """Read described states, and their file. Raises InputError naming key or column."""
     table = read_table(
-        StatesTable, path, "states", beside=("twists",), fill=lambda content: fill_preset(path, content)
+        StatesTable, path, "states", others=("twists",), fill=lambda content: fill_preset(path, content)
     )
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),

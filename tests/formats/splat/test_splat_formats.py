@@ -88,9 +88,9 @@ def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -
     for suffix in (".splat", ".spz"):
         found = FORMATS[suffix]
         found.write(tmp_path / f"a{suffix}", gaussians, {})
-        held, back = found.held(gaussians), found.read(tmp_path / f"a{suffix}")[0]
-        assert not differences(held, back).beyond(found.bound(gaussians))
-        assert differences(held, gaussians).color > 5
+        reduced, back = found.reduce(gaussians), found.read(tmp_path / f"a{suffix}")[0]
+        assert not differences(reduced, back).beyond(found.bound(gaussians))
+        assert differences(reduced, gaussians).color > 5
     assert back.scales[0, 1] == pytest.approx(np.exp(-10), rel=1e-5)
     assert back.harmonics[1, 5, 0] == -1.0
 
@@ -143,15 +143,15 @@ def test_what_is_written_reads_back_within_a_bound_that_is_not_loose(
     gaussians, path = labelled(3000, degree), tmp_path / f"a{kind.suffix}"
     kind.write(path, gaussians, {"scene": "made up"})
     back, comments = kind.read(path)
-    held, bound = kind.held(gaussians), kind.bound(gaussians)
-    measured = differences(held, back)
+    reduced, bound = kind.reduce(gaussians), kind.bound(gaussians)
+    measured = differences(reduced, back)
     assert not measured.beyond(bound)
-    assert np.array_equal(back.labels, held.labels)
+    assert np.array_equal(back.labels, reduced.labels)
     assert isinstance(read_splats(path)[0], GaussianSet)
     if kind.is_rounded:
         assert degree < 3 or all(asdict(measured)[name] >= 0.7 * most for name, most in asdict(bound).items())
         return
-    assert held is gaussians and max(asdict(bound).values()) <= 1e-4
+    assert reduced is gaussians and max(asdict(bound).values()) <= 1e-4
     assert comments["scene"] == "made up"
     assert back.harmonics.shape[1] == (degree + 1) ** 2
     kind.write(tmp_path / "again", back, {"scene": "made up"})

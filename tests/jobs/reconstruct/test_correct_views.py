@@ -92,7 +92,7 @@ def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
     bend = result.metrics["depth_bends"]["camera"]
     assert result.metrics["depth_bend"] == bend["largest"] > 0.02
     assert bend["residual_after"] < 0.1 * bend["residual_before"]
-    assert any("freed of a bend of at most" in reason.sentence for reason in result.verdict.reasons)
+    assert any("corrected for a bend of at most" in reason.sentence for reason in result.verdict.reasons)
     scene = SceneFolder(tmp_path / "scene")
     assert scene.made_from["depth_bend"] == bend["largest"]
     for frame in off:
@@ -186,7 +186,7 @@ def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_pa
     away[:3, 3] += [30.0, 0.0, 0.0]
     off[2] = replace(off[2], T_world_camera=away)
     notes = [reason.sentence for reason in reconstruct(request(off, tmp_path / "scene")).verdict.reasons]
-    assert any("not put right" in note and f"at {off[2].stamp_ns}" in note for note in notes)
+    assert any("not corrected" in note and f"at {off[2].stamp_ns}" in note for note in notes)
 
 
 def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def masks(hand_mm: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changed", "facts", "words"),
     [
-        ({"repeated_frames": {"cam1": 3}}, {}, "camera cam1: 3 frames repeat the depth of the one before: left out"),
+        ({"repeated_frames": {"cam1": 3}}, {}, "camera cam1: left out 3 frames that repeat the depth before them"),
         (
             {"unrepresented_voxels": 271, "unrepresented_volume": 271 * 0.02**3},
             {"value": 271, "remedy": "raise --max-splats above 5000"},
@@ -132,7 +132,7 @@ def test_what_is_wrong_with_a_map_is_noted_with_its_figures(
 def test_an_empty_map_is_not_evaluable_and_balls_alone_are_no_empty_map() -> None:
     verdict = reconstruct_verdict(made(*STEPS, splats=40), [])
     assert (verdict.exit_code, verdict.label) == (5, "not evaluable")
-    assert "map: it is empty: it has no splat of an object; give a --box" in verdict.sentence
+    assert "map: expected splats of objects, got none; give a --box" in verdict.sentence
     assert notes(made(*STEPS, splats=40, unrepresented_voxels=1))
 
 
@@ -140,10 +140,10 @@ def test_a_camera_without_depth_for_longer_than_evidence_lasts_is_noted_with_its
     blind = tuple(row(step, *(("cam1",) if 8 <= step <= 19 else ())) for step in range(30))
     (said,) = notes(made(*blind))
     assert (said.who, said.time_s, said.value) == ("cam1", pytest.approx(0.8), pytest.approx(1.1))
-    assert "camera cam1 returned none from 0.80 to 1.90 s" in said.sentence
+    assert "camera cam1 returned no depth from 0.80 to 1.90 s" in said.sentence
     short = tuple(row(step, *(("cam1",) if 8 <= step <= 18 and step != 13 else ())) for step in range(30))
     (said,) = notes(made(*short))
-    assert (said.who, said.sentence) == ("", "10 frames have none, which seeds nothing")
+    assert (said.who, said.sentence) == ("", "10 frames have no depth, and seeded no splats")
     assert notes(made(*blind, is_seeded=True)) == (), "nobody looked at depth"
     (said,) = notes(made(*blind, has_clock=False))
     assert said.who == "", "views without a clock have no times"

@@ -250,13 +250,19 @@ ALONE: dict[str, Broken] = {
     ),
     "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "from the arm through unseen space"),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 7.7 mm from the arm"),
-    "lost edge": (beside_a_lost_edge, (), "known space", "not evaluable", "lost 11.0 mm from the arm"),
+    "lost edge": (
+        beside_a_lost_edge,
+        (),
+        "known space",
+        "not evaluable",
+        "an edge without depth is 11.0 mm from the arm",
+    ),
     "lost edge at last": (
         beside_a_lost_edge_at_the_last_moment,
         (),
         "known space",
         "not evaluable",
-        "lost 11.0 mm from the arm",
+        "an edge without depth is 11.0 mm from the arm",
     ),
     "evidence age": (
         frames_that_renew_nothing,

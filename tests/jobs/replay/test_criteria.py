@@ -132,13 +132,13 @@ def loop_of(kind: str, metrics: Mapping[str, float], num_near: int = 0) -> Judge
 def test_a_step_that_is_not_solved_fails_the_controller(what: str) -> None:
     (reason,) = controller(loop_of(what, {f"num_{what}": 2}))
     assert reason.outcome is Outcome.FAILED
-    assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+    assert f"at 2 of 5 steps (2 {what.replace('_', ' ')})" in reason.sentence
 
 
 def test_a_row_relaxed_within_twice_the_margin_fails_the_controller() -> None:
     (reason,) = controller(loop_of("relaxed", {"num_relaxed": 3}, num_near=2))
     assert reason.outcome is Outcome.FAILED
-    assert "at 2 relaxed of 5 steps" in reason.sentence
+    assert "at 2 of 5 steps (2 relaxed)" in reason.sentence
     (passed,) = controller(loop_of("relaxed", {"num_relaxed": 3}))
     assert passed.outcome is Outcome.PASSED
     assert passed.sentence == "all 5 steps solved, 3 of them with rows relaxed, all over twice their margin away"
@@ -201,7 +201,7 @@ def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
 
 def test_a_log_that_ends_with_the_motion_is_not_blamed_for_an_old_map() -> None:
     (reason,) = evidence.map_age(judged({"map_age_s": np.append(np.full(NUM - 1, 0.1), 1.01)}))
-    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s, from 1.00 to 1.00 s")
+    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s (from 1.00 to 1.00 s)")
 
 
 @pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.PASSED), (1.5, Outcome.FAILED)])

@@ -38,7 +38,7 @@ def look_free(points: Float64) -> tuple[Index, UInt8]:
 def test_a_scene_is_known_from_its_latency_on_until_the_next_is() -> None:
     at = fields_at((150, 250), lambda index: index, lambda index: index)  # type: ignore[arg-type, return-value]
     assert [at(stamp) for stamp in (150, 249, 250, 10_000)] == [0, 0, 1, 1]
-    expect_refusal("no scene is known at stamp 149 ns", at, 149, error=NotEvaluableError)
+    expect_refusal("no map is known yet at stamp 149 ns", at, 149, error=NotEvaluableError)
 
 
 def test_the_depth_of_a_time_is_the_newest_known_until_the_next_map_is() -> None:
@@ -98,7 +98,7 @@ def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(
     record = ReplayRecord(model, scene, config=Config(), max_map_age=9.0, is_continuous=False)
     for second in range(4):
         record.measure_block(np.array([second * SECOND]), q[None], np.zeros((1, 7)))
-    first, least = record.fixed_parts.found["link0[0]"]
+    first, least = record.fixed_parts.clearances["link0[0]"]
     assert first > 0.1
     assert least == (pytest.approx(-0.01, abs=0.03) if has_come else first)
 
@@ -219,6 +219,8 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
         code, verdict = stage.replayed("--field", str(field))
         assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
         words = (
-            "the space that cameras saw is not recorded" if state is None else "100 % of the space within the margin"
+            "expected a record of the space that cameras saw"
+            if state is None
+            else "100 % of the space within the margin"
         )
         assert words in verdict["sentence"]

@@ -124,7 +124,7 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
     assert len(scene.stamps_ns) == 1
     first = scene.stamps_ns[0]
     assert scene.first_ns == first + SECOND // 4
-    expect_refusal("no scene is known", scene.at, first, error=NotEvaluableError)
+    expect_refusal("no map is known yet", scene.at, first, error=NotEvaluableError)
     for num, seconds in ((1, 0.44), (2, 0.46), (3, 0.66), (3, 0.5)):
         scene.at(first + round(seconds * SECOND))
         assert len(scene.stamps_ns) == num

@@ -103,7 +103,7 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: of_run(s, inputs={"--perturb pose-error=0.01": "pose-error=0.01"}),
         "was made with --perturb pose-error=0.01, this log is read without one",
     ),
-    "no digests": (without_digests, "is of an earlier version"),
+    "no digests": (without_digests, "an earlier version wrote it"),
     "millimetres": (lambda s: splats_changed(s, lambda splats: moved(splats, 1e3)), "splats and occupancy disagree"),
     "moved by 3 m": (
         lambda s: splats_changed(s, lambda splats: moved(splats, by=-3)),
@@ -113,7 +113,7 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: splats_changed(s, lambda splats: splats.select(np.arange(len(splats)) == 0)),
         "of 24 occupied voxels are represented",
     ),
-    "no snapshot left": (lambda s: (emptied(s), of_run(s, parts=part_digests(s)))[1], "has no snapshot"),
+    "no snapshot left": (lambda s: (emptied(s), of_run(s, parts=part_digests(s)))[1], "got only the map of its end"),
 }
 
 
@@ -196,11 +196,11 @@ def test_a_truth_of_another_recording_is_refused(stage: Stage, capsys: pytest.Ca
     document["clearance"]["distance"][3] -= 0.05
     write_json(truth, document)
     assert stage.judged("--truth", str(truth), scene=scene) == (4, {})
-    assert "is of another recording: the logged motion has clearances up to 50 mm off" in capsys.readouterr().err
+    assert "is of another recording: its clearances differ by up to 50 mm from" in capsys.readouterr().err
     document["clearance"]["stamps"] = [stamp + 7 for stamp in document["clearance"]["stamps"]]
     write_json(truth, document)
     assert stage.judged("--truth", str(truth), scene=scene) == (4, {})
-    assert "none of its 11 stamps is in the log" in capsys.readouterr().err
+    assert "the log has none of its 11 stamps" in capsys.readouterr().err
 
 
 def test_a_rounded_truth_is_of_the_recording(stage: Stage) -> None:

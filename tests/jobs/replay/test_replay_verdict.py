@@ -302,7 +302,7 @@ def test_a_margin_that_only_the_grids_bound_breaks_is_a_matter_of_the_grid(stage
 def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stage) -> None:
     code, verdict = stage.judged_by_field(FAR)
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
-    assert "does not say what time it shows" in verdict["sentence"]
+    assert "the baked field has no time" in verdict["sentence"]
 
 
 def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
@@ -338,7 +338,7 @@ def test_a_controller_that_cannot_keep_its_rows_fails_alone(stage: Stage, monkey
     goal = "--goal-joints=" + ",".join(str(v) for v in START)
     code, verdict = stage.judged("--set", "control.self_margin=0.06", goal, mode="closed-loop")
     assert (code, verdict["label"], decisive(verdict)) == (1, "controller failed", {"controller": "failed"})
-    assert "its rows could not be satisfied at 1 relaxed of 1 steps" in verdict["sentence"]
+    assert "constraints could not be satisfied at 1 of 1 steps (1 relaxed)" in verdict["sentence"]
 
 
 def test_a_goal_that_is_not_reached_fails_alone(stage: Stage) -> None:

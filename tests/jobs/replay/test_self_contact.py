@@ -205,7 +205,7 @@ class Table:
     """Table, things on it and the visitor: the exact distance, and its gradient."""
 
     def __init__(self) -> None:
-        self.solids = [*tabletop.furniture(), *tabletop.things(), tabletop.visitor(0, 1)]
+        self.solids = [*tabletop.furniture(), *tabletop.objects(), tabletop.visitor(0, 1)]
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         distance, surface = closest_of(self.solids, points, 0)
@@ -265,7 +265,7 @@ def test_the_margin_as_asked_for_relaxes_every_step_of_an_fr3(fr3: MeasuredRobot
 
 
 def test_what_the_pairs_of_an_fr3_keep_keeps_their_surfaces_apart(fr3: MeasuredRobot) -> None:
-    kept = {pair.links: pair for pair in fr3.kept}
+    kept = {pair.links: pair for pair in fr3.pair_margins}
     assert set(kept) == {("fr3_link5", "fr3_link7"), ("fr3_link5", "fr3_hand")}
     for pair in kept.values():
         assert -0.015 < pair.margin < 0.02
@@ -286,7 +286,7 @@ def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredR
     q = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 0.2, 2.0])
     assert sphere_gap(panda.model, q, "link5", "link7") > 0.015
     assert nearest(panda, q) < 0
-    (kept,) = panda.kept
+    (kept,) = panda.pair_margins
     assert kept.links == ("panda_link5", "panda_link7")
     assert kept.surface_gap < 0
 

@@ -151,7 +151,7 @@ def test_texts_of_a_run_are_no_markup(run: Runs) -> None:
     ("break_it", "words"),
     [
         (lambda path: path.rename(path.with_name("audit.partial")), "still writing, or was interrupted"),
-        (lambda path: (path / "run.json").unlink(), "it has no run.json"),
+        (lambda path: (path / "run.json").unlink(), "got a folder without run.json"),
         (lambda path: (path / "run.json").write_text("[]"), "expected what a command of splatctrl writes"),
         (
             lambda path: patch_json(path / "run.json", lambda f: f | {"splatctrl": "99.1"}),

@@ -227,7 +227,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run_session(folder: Path, *names: str) -> JudgedResult:
     first, *beside = (folder / name for name in names)
-    recording = RecordingRequest(path=first, beside=tuple(beside))
+    recording = RecordingRequest(path=first, others=tuple(beside))
     return score(ScoreRequest(scene=folder / "scene", recording=recording, images="none"))
 
 
@@ -270,8 +270,8 @@ def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
 
 
 def test_a_log_beside_an_image_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"views.toml: expected a log beside others, got images in a folder"):
-        RecordingRequest(path=tmp_path / "views.toml", beside=(tmp_path / "b.mcap",))
+    with pytest.raises(UsageError, match=r"views.toml: expected a log, as the others are, got a folder of images"):
+        RecordingRequest(path=tmp_path / "views.toml", others=(tmp_path / "b.mcap",))
 
 
 STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)

@@ -128,7 +128,7 @@ def test_a_protocol_that_is_none_or_holds_out_twice_is_refused(place: Path) -> N
     held_out = SourceOptions(holdout=("1",))
     twice = RecordingRequest(path=place / "mvsnet", is_dtu=True, protocol=HOLDOUT, options=held_out)
     expect_refusal(
-        "--holdout: the protocol says what is held out", scored, place, "mvsnet", recording=twice, error=UsageError
+        "--holdout: the protocol holds views out already", scored, place, "mvsnet", recording=twice, error=UsageError
     )
 
 

@@ -259,7 +259,7 @@ def test_a_journal_that_is_cut_gives_what_was_committed_before_and_a_missing_one
     assert stamps(file) == list(range(1, 14)) and "bag.db3-wal" in read(file)[1].all_notes[0]
     empty = make_killed(tmp_path / "empty")
     empty.with_name("bag.db3-wal").unlink()
-    expect_refusal("bag.db3-wal is not beside it.*; copy bag.db3-wal from where the bag was recorded", read, empty)
+    expect_refusal("bag.db3-wal is missing.*; copy bag.db3-wal from where the bag was recorded", read, empty)
 
 
 def test_values_of_the_wrong_type_are_counted_and_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path) -> None:

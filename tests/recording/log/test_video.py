@@ -263,7 +263,7 @@ def test_stamps_that_are_missing_or_too_few_or_unreadable_are_named(tmp_path: Pa
         (tmp_path / "color.csv").write_text("\n".join(lines))
         expect_refusal(words, VideoFileLog, video)
     (tmp_path / "color.csv").unlink()
-    expect_refusal("color.mp4: no stamps beside it; write color.csv", VideoFileLog, video)
+    expect_refusal("color.mp4: expected a file of stamps next to it, got none; write color.csv", VideoFileLog, video)
     (tmp_path / "other.txt").write_text("\n".join(map(str, STAMPS)))
     mkv = write_mp4(tmp_path / "other.mkv")
     mkv.write_bytes(mkv.read_bytes()[: mkv.stat().st_size // 3])
