@@ -8,8 +8,7 @@ from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.barriers import SceneStep, rate_of
-from splatctrl_cli.control.columns import is_shaped
-from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.columns import is_shaped, runs_of
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TimedPath, guided_goal, pose_error
 from splatctrl_cli.control.replay import Outcome as MotionOutcome
 from splatctrl_cli.control.replay import ReplayTask, closed_loop, is_at_goal

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError, refuse_if, require
 from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import finite, output_path, sha256

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
-from splatctrl_cli.control.columns import names_at
-from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.columns import Event, EventKind, names_at
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.inputs import LoggedStates

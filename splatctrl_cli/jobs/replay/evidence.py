@@ -17,8 +17,7 @@ from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.columns import names_at
-from splatctrl_cli.control.events import Event, EventKind, Obstacle, clearance_signals, events_of
+from splatctrl_cli.control.columns import Event, EventKind, Obstacle, clearance_signals, events_of, names_at
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges

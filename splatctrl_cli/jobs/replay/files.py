@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, UNITS, Event, EventKind, first_intervention
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN, UNITS, Event, EventKind, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
 from splatctrl_cli.control.barriers import SceneStep, guard_people
-from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
+from splatctrl_cli.control.columns import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.clusters import NO_SPLAT, ObstacleSpheres, Spheres, obstacle_spheres

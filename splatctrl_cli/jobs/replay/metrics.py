@@ -7,8 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
-from splatctrl_cli.control.columns import RUNGS
-from splatctrl_cli.control.events import first_intervention
+from splatctrl_cli.control.columns import RUNGS, first_intervention
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind

@@ -8,7 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
-from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.columns import Event, EventKind
 from splatctrl_cli.evaluate.metrics import lowest
 from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.criteria import (

@@ -6,7 +6,7 @@ from dataclasses import field as made_by
 from pathlib import Path
 
 from splatctrl_cli.config import Config, fixed
-from splatctrl_cli.control.events import Event
+from splatctrl_cli.control.columns import Event
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation

@@ -19,14 +19,16 @@ from splatctrl_cli.control.audit import (
     observed_at,
     part_clearances,
 )
-from splatctrl_cli.control.columns import NamedColumns, audit_columns, names_at
-from splatctrl_cli.control.events import (
+from splatctrl_cli.control.columns import (
     Event,
     EventKind,
+    NamedColumns,
     Obstacle,
+    audit_columns,
     audit_signals,
     events_of,
     motion_signals,
+    names_at,
     step_signals,
 )
 from splatctrl_cli.control.limits import MotionLimits

@@ -7,7 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
-from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.columns import runs_of
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, plural
 from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Judged, mm, worst_state
 

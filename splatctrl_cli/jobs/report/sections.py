@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, FigureChange, compare
 from splatctrl_cli.jobs.runs.run_folder import RunFolder
 from splatctrl_cli.report.page import Cell, Row, RunSection, Table, picture

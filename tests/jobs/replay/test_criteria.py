@@ -12,8 +12,7 @@ import pytest
 
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.audit import AuditTrace, Clearance
-from splatctrl_cli.control.columns import audit_columns, step_columns
-from splatctrl_cli.control.events import Event, EventKind, Signal, events_of
+from splatctrl_cli.control.columns import Event, EventKind, Signal, audit_columns, events_of, step_columns
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
