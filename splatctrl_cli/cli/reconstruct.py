@@ -9,8 +9,7 @@ from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.jobs.reconstruct.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recordings.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.jobs.running.device import describe_device
-from splatctrl_cli.jobs.running.resume import DECIDING_OPTIONS
+from splatctrl_cli.jobs.running.device import DECIDING_OPTIONS, describe_device
 from splatctrl_cli.kernels import native
 
 

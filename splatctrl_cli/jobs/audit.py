@@ -30,9 +30,8 @@ from splatctrl_cli.jobs.replay.replay import check_request, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import write_page_of_runs
 from splatctrl_cli.jobs.robot.logged_robot import installed_urdf, logged_urdf
-from splatctrl_cli.jobs.running.device import AUTO, RunOptions
+from splatctrl_cli.jobs.running.device import AUTO, RunOptions, deciding_versions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import deciding_versions
 from splatctrl_cli.jobs.runs.run_folder import open_run, read_object
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.source import open_source

@@ -9,8 +9,8 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.jobs.running.device import advise_resumption, check_same_run
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import advise_resumption, check_same_run
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identity, write_capture
 from splatctrl_cli.recording.folder.folder_views import HOLDOUT
