@@ -12,8 +12,7 @@ from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 

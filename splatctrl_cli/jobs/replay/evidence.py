@@ -28,8 +28,7 @@ from splatctrl_cli.files.spilled_rows import Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
-from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps

@@ -30,8 +30,7 @@ from splatctrl_cli.errors import InputError, UsageError, refuse_faults, require
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.state_source import read_twists
 from splatctrl_cli.records import Float64, Stamps

@@ -17,9 +17,8 @@ from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SeparationInput
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SeparationInput, Trace
 from splatctrl_cli.jobs.replay.state_pass import blocks_of
-from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.records import Bool, Float64, Floats
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names

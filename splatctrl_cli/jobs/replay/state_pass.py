@@ -36,7 +36,7 @@ from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
-from splatctrl_cli.jobs.replay.trace import BLOCK, Trace
+from splatctrl_cli.jobs.replay.request import BLOCK, Trace
 from splatctrl_cli.records import Bool, Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel

@@ -24,9 +24,8 @@ from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION, clearance, surface_clearance, unlearned_link
-from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange, Trace
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
-from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.scene.self_mask import self_mask_metrics
 from splatctrl_cli.voxels import EvidenceClass
