@@ -54,8 +54,8 @@ from splatctrl_cli.jobs.replay.known_scene import (
 )
 from splatctrl_cli.jobs.replay.metrics import metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
+from splatctrl_cli.jobs.replay.replay import replay_verdict
 from splatctrl_cli.jobs.replay.request import ReplayInputs
-from splatctrl_cli.jobs.replay.verdict import replay_verdict
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.kernels import native, num_threads
