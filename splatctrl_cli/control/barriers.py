@@ -8,8 +8,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.limits import braking_speed
-from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
+from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State, braking_speed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers

@@ -13,10 +13,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
 from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkController, View
-from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.control.terms import JointLimits, RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.records import Float64, Stamps

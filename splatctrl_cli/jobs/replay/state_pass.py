@@ -31,9 +31,9 @@ from splatctrl_cli.control.columns import (
     names_at,
     step_signals,
 )
-from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
+from splatctrl_cli.control.terms import MotionLimits
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay.request import BLOCK, Trace
