@@ -117,10 +117,9 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, depth_box
 from splatctrl_cli.simulate.arm import PEAK, Motion, arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.depth_camera import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive, Texture, Track, box, solid
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions, Scene
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE, arm_solids, cameras, furniture, texture
 from splatctrl_cli.simulate.truth import closest_of, distance_to
 from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState

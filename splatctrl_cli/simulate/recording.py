@@ -14,9 +14,8 @@ from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import UNMODELLED, Capsule, Motion, link_shape
-from splatctrl_cli.simulate.depth_camera import WIDTH, DepthNoise, StereoDepth
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import WIDTH, Camera, DepthNoise, Renderer, StereoDepth
 from splatctrl_cli.simulate.truth import distance_to
 
 START_NS = 1_700_000_000_000_000_000
