@@ -9,7 +9,7 @@ from pathlib import Path
 from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.control.line_process import shown
-from splatctrl_cli.control.separation_file import read_separation
+from splatctrl_cli.control.separation import read_separation
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import (
     JudgedResult,

@@ -14,7 +14,7 @@ from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
-from splatctrl_cli.control.separation_file import DeclaredSeparation
+from splatctrl_cli.control.separation import DeclaredSeparation
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Reason
 from splatctrl_cli.files.spilled_rows import ObjectFile, RowFile, Rows

@@ -11,8 +11,16 @@ from splatctrl_cli.config.fixed import MISPLACED
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
 from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.near_space import NEVER_SEEN, Seen
-from splatctrl_cli.control.separation import PERSON_SPEED, Approach, ArmMotion, Stop
-from splatctrl_cli.control.separation_file import ANYTHING, LABELLED, PERSON, DeclaredSeparation
+from splatctrl_cli.control.separation import (
+    ANYTHING,
+    LABELLED,
+    PERSON,
+    PERSON_SPEED,
+    Approach,
+    ArmMotion,
+    DeclaredSeparation,
+    Stop,
+)
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
