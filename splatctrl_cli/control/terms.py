@@ -1,4 +1,4 @@
-"""Terms of the QP of III-E over joint velocities; the solver adds them. Joint limits as one velocity box, never empty.
+"""Terms of the QP of III-E over joint velocities, which the solver adds; joint limits as one velocity box.
 
 A further term is a function from state to cost ``(H, c)``, or a `BarrierTerm` with rows ``G v - s <= h``.
 """

@@ -1,4 +1,4 @@
-"""A check: faults of a recording, before they cost an hour. Conversion of recordings into captures."""
+"""A check: faults of a recording, before they cost an hour; and its conversion into a capture."""
 
 import json
 import statistics

@@ -1,4 +1,7 @@
-"""Exact RGB-D images by ray casting: depth at pixel centres, colour from four rays. Two models of an active-stereo camera measure from exact depth."""
+"""Exact RGB-D images by ray casting: depth at pixel centres, colour from four rays.
+
+Two models of an active-stereo camera measure from exact depth.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
