@@ -1,4 +1,4 @@
-"""Where a fit or bake computes, a processor or a card worth its start, and what an interrupted run resumes."""
+"""Computation of a fit or bake on a processor or a card worth its start; and resumption of an interrupted run."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
