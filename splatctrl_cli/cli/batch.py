@@ -30,7 +30,7 @@ from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
 
 PRELOADED = (  # of a runner
-    *("check", "ingest", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
+    *("check", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
 )
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options a batch gives itself

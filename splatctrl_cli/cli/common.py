@@ -15,7 +15,7 @@ from splatctrl_cli.cli.parser import Adds, group, join_run_options, option, real
 from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
-from splatctrl_cli.errors import UsageError, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import JudgedResult, Result, gate
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics
@@ -80,10 +80,8 @@ def names_of(option: str, choices: Sequence[str], text: str) -> tuple[str, ...]:
 
 
 def pose(text: str) -> tuple[float, ...]:
-    try:
+    with refuse_faults(str, ValueError, error=argparse.ArgumentTypeError):
         return checked_pose(numbers(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _device(text: str) -> str:

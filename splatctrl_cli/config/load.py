@@ -183,9 +183,8 @@ def _has_type(value: Any, hint: Any) -> Any:
     if isinstance(value, list) and tuple[float, ...] in options:
         numbers = tuple(_has_type(item, float) for item in value)
         return numbers if all(type(number) is float for number in numbers) else value
-    if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
-        return float(value)
-    return value
+    is_float = float in options and type(value) is int and abs(value) < 1 << 1023  # what a float holds
+    return float(value) if is_float else value
 
 
 DEFAULT = "default"

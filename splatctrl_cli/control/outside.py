@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
@@ -117,16 +118,13 @@ class Program(LineProcess):
         self.clock.spent, has_rows = 0.0, False
         line = _line({"id": self._num} | question)
         while True:
-            answer = self._ask(line)
+            answer = _document(self.clock.measure(partial(self.exchange, line)))
             if answer.get("id") != self._num:
                 got = shown(repr(answer.get("id")))
                 raise Misbehaved(Fault.OUT_OF_TURN, f"expected the answer to id {self._num}, got one to {got}")
             if answer.get("ask") != "rows" or has_rows:
                 return checked_velocity(answer, limits)
             line, has_rows = _line({"rows": rows()}), True
-
-    def _ask(self, line: bytes) -> Document:
-        return _document(self.clock.measure(lambda limit: self.exchange(line, limit)))
 
 
 class RecordedCommands:

@@ -127,8 +127,7 @@ def closed_loop(
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
-        logged = course.anchor(index, stamp)
-        if logged is not None:
+        if (logged := course.anchor(index, stamp)) is not None:
             q, last_velocity = logged
             anchored.append(index)
         if field_at(stamp) is not field:

@@ -182,9 +182,7 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
         remedy=f"in the order {', '.join(joints)}",
         error=UsageError,
     )
-    if np.all(each == 0):
-        return None
-    return np.broadcast_to(each, (len(joints),)).copy()
+    return np.broadcast_to(each, (len(joints),)).copy() if np.any(each != 0) else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -111,8 +111,10 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
         if pair.holds:
             good.append(pair.median)
             continue
-        text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
-        text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
+        text = (
+            f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see); "
+            f"expected at most {1e3 * pair.limit:.0f} mm"
+        )
         remedy = f"{CAUSES}: calibrate the cameras' poses again (splatctrl calibrate), or widen the range of depth"
         value = round(1e3 * pair.median, 2)
         if len(both) > 1:

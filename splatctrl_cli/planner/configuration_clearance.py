@@ -101,9 +101,8 @@ def _packed(solid: Solid) -> Float64:
 def _sizes(solid: Solid) -> tuple[float, ...]:
     if isinstance(solid, Ball):
         return (float(solid.radius),)
-    if isinstance(solid, Cuboid):
-        return tuple(float(v) for v in solid.size)
-    return float(solid.radius), float(solid.length)
+    sizes = solid.size if isinstance(solid, Cuboid) else (solid.radius, solid.length)
+    return tuple(float(size) for size in sizes)
 
 
 @dataclass(frozen=True, kw_only=True)

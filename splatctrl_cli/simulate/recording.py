@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -161,7 +162,10 @@ class Recording:
             if cameras is not None and renderer.camera.name not in cameras:
                 continue
             color, depth = renderer.image([*arm, *passing], meshes)
-            human = _mark_shown(depth, renderer.depth(arm, meshes)) if self._has_people else None
+            human = None
+            if self._has_people:
+                without = renderer.depth(arm, meshes)
+                human = np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)
             if noise is not None:
                 rng, focal = np.random.default_rng([self.options.seed, number, index]), renderer.camera.intrinsics.fx
                 depth = noise.applied(depth, rng, focal=focal)
@@ -185,11 +189,14 @@ class Recording:
 
     def static_transforms(self) -> list[Transform]:
         """Frames world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
-        transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
-        for camera in self.cameras:
-            transforms.append(("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T))
-            transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
-        return transforms
+        of_cameras = (
+            (
+                ("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T),
+                (f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK),
+            )
+            for camera in self.cameras
+        )
+        return [("world", self.robot.urdf.links[0], self.robot.T_world_base), *chain.from_iterable(of_cameras)]
 
     def link_transforms(self, q: Float64) -> list[Transform]:
         """Parent link -> link, except the root, at q (J,)."""

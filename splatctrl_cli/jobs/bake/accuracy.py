@@ -128,12 +128,15 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
     )
     urdf, names = request.urdf, recording.joint_names
     robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
-    counted = []
-    for frame, at in newest.values():
-        spheres = None
-        if robot is not None and at is not None:
-            spheres = robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii
-        counted.append(counted_pixels(frame, source.workspace, spheres))
+    spheres = [
+        None
+        if robot is None or at is None
+        else (robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii)
+        for _, at in newest.values()
+    ]
+    counted = [
+        counted_pixels(frame, source.workspace, its) for (frame, _), its in zip(newest.values(), spheres, strict=True)
+    ]
     return compare_with_held_out_depth(
         grid, [frame for frame, _ in newest.values()], seed=request.seed, counted=counted
     )
@@ -222,34 +225,33 @@ def bake_verdict(
     """Judge the channels' loss of distance [m], unobserved boxes, and each ``--require``."""
     statistics, voxel = document["statistics"], document["voxel"]
     num_cells, loss = statistics["num_cells"], LOSS * voxel
-    reasons = [
-        Reason(
-            criterion="loss",
-            outcome=Outcome.PASSED,
-            sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
-            value=loss,
-            threshold=request.config.field.max_loss,
-            unit="m",
-            count=num_cells,
-        )
-    ]
-    if has_occupancy and statistics["never_seen_share"] == 1:
-        reasons.append(
-            Reason(
-                criterion="known space",
-                outcome=Outcome.NOT_EVALUABLE,
-                sentence="no cell of the grid was ever seen by a camera",
-                value=1.0,
-                threshold=1.0,
-                remedy="give a --box that the cameras saw",
-                count=num_cells,
-            )
-        )
-    reasons += [note(criterion="field", sentence=text) for text in document["warnings"]]
+    of_loss = Reason(
+        criterion="loss",
+        outcome=Outcome.PASSED,
+        sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
+        value=loss,
+        threshold=request.config.field.max_loss,
+        unit="m",
+        count=num_cells,
+    )
+    never_seen = Reason(
+        criterion="known space",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence="no cell of the grid was ever seen by a camera",
+        value=1.0,
+        threshold=1.0,
+        remedy="give a --box that the cameras saw",
+        count=num_cells,
+    )
     counts = counts_of(metrics)
     return verdict_of(
         "sdf-bake",
-        [*reasons, *gate_reasons(request.require, metrics, counts)],
+        [
+            of_loss,
+            *([never_seen] if has_occupancy and statistics["never_seen_share"] == 1 else []),
+            *(note(criterion="field", sentence=text) for text in document["warnings"]),
+            *gate_reasons(request.require, metrics, counts),
+        ],
         scope=f"{' x '.join(map(str, document['shape']))} cells of {voxel:g} m, {metrics['num_splats']} splats",
         counts=counts,
     )

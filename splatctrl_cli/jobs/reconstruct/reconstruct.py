@@ -114,10 +114,9 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Jud
 
 
 def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
+    off = {"learn": False} if request.self_model == NO_SELF_MODEL else {}
     files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
-    is_off = request.self_model == NO_SELF_MODEL
-    files["self-model"] = None if is_off else request.self_model
-    off = {"learn": False} if is_off else {}
+    files |= {"self-model": None if off else request.self_model}
     return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
 
 

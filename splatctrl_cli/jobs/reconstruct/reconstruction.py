@@ -70,7 +70,6 @@ class ReconstructRequest(RunOptions):
     allow_disagreement: bool = False
     corrections: Corrections = field(default_factory=Corrections)
     resume: bool = False
-    seed: int = 0
     device: str = CPU
     require: Sequence[str] = ()
     options: Mapping[str, object] = field(default_factory=dict)
@@ -393,9 +392,8 @@ class Reconstruction:
             return self.request.box
         if self.robot is not None:
             return self.robot.reach_box
-        if self.cloud is not None:
-            return cloud_box(self.cloud)
-        return depth_box(first.frames, self.config.occupancy.max_range, self.config.scene.scale or 1.0)
+        limit, scale = self.config.occupancy.max_range, self.config.scene.scale or 1.0
+        return depth_box(first.frames, limit, scale) if self.cloud is None else cloud_box(self.cloud)
 
     def _posture(self, step: TimeStep) -> RobotPosture | None:
         if self.robot is None or step.position is None:

@@ -54,11 +54,11 @@ def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]
             nearest[record.camera] = record
         if record.stamp_ns >= last and len(nearest) == len(wanted):
             break
-    lines = []
-    for camera, first in wanted.items():
-        found = nearest.get(camera)
-        lines += [f"has no camera {camera}"] if found is None else _differences(first, found)
-    return lines
+    return [
+        line
+        for camera, first in wanted.items()
+        for line in (_differences(first, nearest[camera]) if camera in nearest else [f"has no camera {camera}"])
+    ]
 
 
 def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

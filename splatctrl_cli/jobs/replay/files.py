@@ -263,9 +263,8 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
     if "clearance_true" in trace:
         least = np.fmin(least, trace["clearance_true"])
     states = worst_moments(trace.stamp_ns, least, num)
-    if not states or not inputs.source.has_clock:
-        return []
-    return sights_of([_moment(inputs, replay, state) for state in states], frames)
+    moments = [_moment(inputs, replay, state) for state in states if inputs.source.has_clock]
+    return sights_of(moments, frames) if moments else []
 
 
 def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
@@ -280,9 +279,9 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
             f"{frame.camera}, taken {(moment.stamp_ns - frame.stamp_ns) * 1e-9:.2f} s before; spheres of the {whose}",
         )
         draw_sight(folder / f"worst_{number}.png", replace(moment, caption=caption), frame)
-    if len(seen) < len(sights):
-        return [f"worst frames: no camera image at or before {len(sights) - len(seen)} of {len(sights)} moments"]
-    return []
+    num_without = len(sights) - len(seen)
+    note = f"worst frames: no camera image at or before {num_without} of {len(sights)} moments"
+    return [note] if num_without else []
 
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:

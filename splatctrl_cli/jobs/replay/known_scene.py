@@ -16,7 +16,7 @@ from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed
 from splatctrl_cli.control.barriers import SceneStep, guard_people
 from splatctrl_cli.control.columns import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.field.clusters import NO_SPLAT, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid_cells import GridField, exact_channel
@@ -120,10 +120,12 @@ def fields_at(
 
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(stamps_ns, stamp_ns - latency_ns) - 1
-        if index < 0:
-            raise NotEvaluableError(
-                f"no scene is known at stamp {stamp_ns} ns", remedy="it was not seen yet; ask for a later time"
-            )
+        refuse_if(
+            index < 0,
+            f"no scene is known at stamp {stamp_ns} ns",
+            remedy="it was not seen yet; ask for a later time",
+            error=NotEvaluableError,
+        )
         return kept(key_of(index))
 
     return at
@@ -170,10 +172,12 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
     has_times = scene.has_clock and bool(scene.snapshots)
-    if latency_ns and not has_times:
-        raise UsageError(
-            f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
-        )
+    refuse_if(
+        latency_ns and not has_times,
+        f"--latency: {path} is one scene for all times: expected snapshots",
+        remedy="leave --latency out",
+        error=UsageError,
+    )
 
     def fields(stamp_ns: int | None) -> KnownFields:
         splats = scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns)

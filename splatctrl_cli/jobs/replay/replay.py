@@ -322,6 +322,5 @@ def _mismatches(
 ) -> tuple[Reason, ...]:
     if request.field is not None:
         return tuple(made_from_mismatches(request.field, known.figures(), logged.source, model))
-    if request.scene is None:
-        return ()
-    return tuple(scene_mismatches(open_scene(request.scene), logged.source, logged.states, model))
+    scene = None if request.scene is None else open_scene(request.scene)
+    return () if scene is None else tuple(scene_mismatches(scene, logged.source, logged.states, model))

@@ -139,7 +139,6 @@ class ReplayRequest(RobotOptions, RunOptions):
     separation: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,6 +35,7 @@ class RunOptions:
 
     config: Config = field(default_factory=Config)
     force: bool = False
+    seed: int = 0
     threads: int = 0
     device: str = "auto"
 
