@@ -133,10 +133,9 @@ def words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> l
     if action.nargs == 0:
         refuse_if(not isinstance(value, bool), f"{where}: expected true or false, got {value!r}", error=UsageError)
         return [name] * value
-    if isinstance(value, Mapping):
-        texts = [f"{key}={text_of(each)}" for key, each in _flat(value)]
-    else:
-        texts = [text_of(each) for each in (value if isinstance(value, list) else [value])]
+    several = value if isinstance(value, list) else [value]
+    is_table = isinstance(value, Mapping)
+    texts = [f"{key}={text_of(each)}" for key, each in _flat(value)] if is_table else [*map(text_of, several)]
     if action.type is Path:
         texts = [str(folder / text) for text in texts]
     if name and not isinstance(action, argparse._AppendAction):

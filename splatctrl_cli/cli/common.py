@@ -133,10 +133,6 @@ def _human_topic(text: str) -> tuple[str, str]:
     return name, topic
 
 
-def _is_topic(text: str) -> bool:
-    return text.partition("=")[2].startswith("/")
-
-
 def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
     if name and rest == "identity":
@@ -250,8 +246,8 @@ SOURCE = (  # the options of a source, all but --cameras in a group of their own
             "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or"
             " of FRAME's",
             fields={
-                "camera_poses": lambda texts: dict(_pose(text) for text in texts if not _is_topic(text)),
-                "camera_pose_topics": lambda texts: dict(_pose_topic(text) for text in texts if _is_topic(text)),
+                "camera_poses": lambda texts: dict(_pose(text) for text in texts if "=/" not in text),
+                "camera_pose_topics": lambda texts: dict(_pose_topic(text) for text in texts if "=/" in text),
             },
         ),
         option(

@@ -101,7 +101,12 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
     ]:
         _check_known(name, PRESETS, "--preset", "")
         yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
-    for section, values in ({} if path is None else _read_toml(path)).items():
+    with (
+        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy="give an existing TOML file"),
+        refuse_faults(f"{path}: not valid TOML", ValueError, error=UsageError),  # UTF-8 and too long integers, too
+    ):
+        document = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
+    for section, values in document.items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         refuse_if(
             not isinstance(values, dict),
@@ -148,14 +153,6 @@ def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> 
         first = ", ".join(list(known)[:8]) + (", ... (splatctrl config --template has all)" if len(known) > 8 else "")
         choices = did_you_mean(name, known, f"known here: {first}", prefix=prefix, cutoff=0.4)
         raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    with (
-        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy="give an existing TOML file"),
-        refuse_faults(f"{path}: not valid TOML", ValueError, error=UsageError),  # UTF-8 and too long integers, too
-    ):
-        return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def _parse_value(text: str) -> Any:

@@ -207,8 +207,7 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         limits = dict(zip(self._model.joint_names, self._model.velocity_limit.tolist(), strict=True))
         velocity, *others = [program.velocity(question, rows, limits) for program in self._programs]
         for other in others:
-            differs = np.flatnonzero(velocity != other)
-            if len(differs):
+            if len(differs := np.flatnonzero(velocity != other)):
                 joint = int(differs[0])
                 name, values = self._model.joint_names[joint], (float(velocity[joint]), float(other[joint]))
                 raise Misbehaved(

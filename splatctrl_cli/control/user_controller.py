@@ -111,8 +111,7 @@ def serve(target: str) -> None:
         answers.flush()
 
     def line() -> dict[str, Any]:
-        text = questions.readline()
-        if not text:
+        if not (text := questions.readline()):
             sys.exit(0)
         document: dict[str, Any] = json.loads(text)
         return document

@@ -35,15 +35,21 @@ _ALLOWING = {  # the options that take an error on
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckRequest(RobotOptions):
-    """One check of a recording; several `paths` only for logs of one session.
+class SessionRequest:
+    """A job on a recording; several `paths` only for logs of one session."""
+
+    paths: tuple[Path, ...]
+    options: SourceOptions = field(default_factory=SourceOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRequest(SessionRequest, RobotOptions):
+    """One check of a recording.
 
     num_images: of each topic, None for all. urdf: robot to compare with; with `spheres` alone the log's. fail_on:
     least severity that fails: "error", "warning" or "never".
     """
 
-    paths: tuple[Path, ...]
-    options: SourceOptions = field(default_factory=SourceOptions)
     num_images: int | None = None
     urdf: Path | None = None
     fail_on: str = "error"
@@ -169,15 +175,10 @@ DECIDING_PACKAGES = ("numpy", "opencv-python-headless")  # whose versions may ch
 
 
 @dataclass(frozen=True, kw_only=True)
-class IngestRequest:
-    """Write a recording as a capture; several `paths` only for logs of one session.
+class IngestRequest(SessionRequest):
+    """Write a recording as a capture; out: None for NAME.capture here, by the first path."""
 
-    out: None for NAME.capture here, by the first path.
-    """
-
-    paths: tuple[Path, ...]
     out: Path | None = None
-    options: SourceOptions = field(default_factory=SourceOptions)
     force: bool = False
     resume: bool = False
 

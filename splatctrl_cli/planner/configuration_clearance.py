@@ -162,9 +162,8 @@ class Clearance:
         own = radii[pairs].sum(axis=1) + self_margin - model.self_allowance
         taken = np.concatenate([(radii + margin)[moving], own])
         rows = np.concatenate([lipschitz * levers[moving], _between(levers, pairs)])
-        chain, compiled = model.chain, None
-        if chain is not None:
-            compiled = EdgeRoom.of(chain, moving.astype(np.int64), pairs.astype(np.int64), taken, rows)
+        chain, which = model.chain, (moving.astype(np.int64), pairs.astype(np.int64))
+        compiled = None if chain is None else EdgeRoom.of(chain, *which, taken, rows)
         room = cls(
             model=model,
             scene=scene,

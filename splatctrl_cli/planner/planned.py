@@ -63,9 +63,8 @@ def time_path(
     motion = np.abs(np.diff(waypoints, axis=0))
     is_long = np.max(motion, axis=1) > 0
     motion, is_new = motion[is_long], np.r_[True, is_long]
-    speed = np.min(velocity_limit / np.maximum(motion, 1e-12), axis=1)
-    if max_rate is not None:
-        speed = np.minimum(speed, max_rate[is_long])
+    fastest = np.inf if max_rate is None else max_rate[is_long]
+    speed = np.minimum(np.min(velocity_limit / np.maximum(motion, 1e-12), axis=1), fastest)
     acceleration = max_acceleration / np.max(motion, axis=1)
     speed = np.minimum(speed, np.sqrt(acceleration))  # a short edge is a triangle
     seconds = 1.0 / speed + speed / acceleration

@@ -307,8 +307,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
 
 def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> Iterator[Later]:
     start = int(states.stamps_ns[0])
-    grid = run.option("--field")
-    if grid is None:
+    if (grid := run.option("--field")) is None:
         known = sets_known(run, states, scene_of(run, roots))
         yield from _space_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:

@@ -210,9 +210,8 @@ def draw_replay(folder: Path, replay: Replay) -> None:
     if "clearance_true" in trace:
         curves["truth"] = trace.rows("clearance_true")
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
-    title = TITLES[replay.mode]
-    if replay.closed_loop is not None and replay.start_time_s > 0:
-        title += f", from {replay.start_time_s:.2f} s of the log"
+    is_late = replay.closed_loop is not None and replay.start_time_s > 0
+    title = TITLES[replay.mode] + (f", from {replay.start_time_s:.2f} s of the log" if is_late else "")
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
     if np.isfinite(shares := trace["class_shares"]).any():
         evidence_picture(folder / "evidence.png", seconds, shares)
@@ -259,9 +258,7 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
     None where no camera has one. Frames after the last moment are not read.
     """
     trace = replay.trace
-    least = trace["clearance_exact"]
-    if "clearance_true" in trace:
-        least = np.fmin(least, trace["clearance_true"])
+    least = np.fmin(trace["clearance_exact"], trace.get("clearance_true", np.nan))
     states = worst_moments(trace.stamp_ns, least, num)
     moments = [_moment(inputs, replay, state) for state in states if inputs.source.has_clock]
     return sights_of(moments, frames) if moments else []

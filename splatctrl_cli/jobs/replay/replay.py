@@ -109,9 +109,8 @@ def replay_verdict(judged: Judged) -> Verdict:
 def _scope(judged: Judged) -> str:
     replay, past = judged.replay, judged.past_end_s
     first = replay.start_time_s
-    end = f"s of the log to {past:.2f} s past its end"
-    if past <= 0:
-        end = f"to {first + replay.trace.seconds(-1):.2f} s of the log"
+    last = first + replay.trace.seconds(-1)
+    end = f"s of the log to {past:.2f} s past its end" if past > 0 else f"to {last:.2f} s of the log"
     motion = "driven" if replay.closed_loop else "logged"
     who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
     return f"{motion} motion from {first:.2f} {end}, {replay.num_states} states{who}"

@@ -214,15 +214,14 @@ class _SeparationPass:
         self, robot: RobotModel, q: Float64, centers: Float64, people: "_Balls | None", speed: Float64
     ) -> ArmMotion:
         points = centers[:, self._moving]
-        gradient = np.zeros(points.shape)
-        if people is not None:
-            gradient = people.field.query(np.ascontiguousarray(points.reshape(-1, 3)))[1].reshape(points.shape)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        gradient = np.zeros_like(flat) if people is None else people.field.query(flat)[1]
         reached = np.linalg.norm(points - robot.base_position, axis=2) + robot.sphere_set.radii[self._moving]
         return ArmMotion(
             joint_speed=speed,
             velocity_limit=robot.velocity_limit,
             jacobian=np.array([robot.spheres_at(posture)[1][self._moving] for posture in q]),
-            gradient=gradient,
+            gradient=gradient.reshape(points.shape),
             extension=reached.max(axis=1) / (self._declared.reach or np.inf),
         )
 

@@ -139,9 +139,9 @@ class FitDevice:
         last = self.history[-1]["device"] if self.history else ""
         if last == CPU:
             return Device()
-        num_pixels, too_little = max(height * width for height, width in sizes), ""
-        if not last and num_splats * num_pixels < CARD_LEAST_WORK:
-            too_little = f"{num_splats} splats on {num_pixels} pixels are too little work for a card"
+        num_pixels = max(height * width for height, width in sizes)
+        is_enough = last or num_splats * num_pixels >= CARD_LEAST_WORK
+        too_little = "" if is_enough else f"{num_splats} splats on {num_pixels} pixels are too little work for a card"
         return automatic(progress, too_little, name=last or CUDA, needed=bytes_needed(num_splats, sizes))
 
     def close(self) -> None:
