@@ -60,21 +60,13 @@ from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels import raster as gaussian_kernels
+from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE, CYLINDER
 from splatctrl_cli.libraries import import_extra as of_extra
 from splatctrl_cli.libraries import is_installed, mpl
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import (
-    Ball,
-    Clearance,
-    Cuboid,
-    HasDistance,
-    OnlyDistance,
-    Rod,
-    Solid,
-    Solids,
-    check_edges,
-)
+from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
@@ -125,7 +117,11 @@ from splatctrl_cli.simulate.truth import closest_of, distance_to
 from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState
 
 __all__ = [
+    "BALL",
+    "BOX",
+    "CAPSULE",
     "CURVE_COLORS",
+    "CYLINDER",
     "GOAL_BLOCKED",
     "HALF_DIAGONAL",
     "INK",
@@ -139,7 +135,6 @@ __all__ = [
     "SURFACE_SCANS",
     "AuditRow",
     "Baker",
-    "Ball",
     "Balls",
     "Bool",
     "Camera",
@@ -147,7 +142,6 @@ __all__ = [
     "Clearance",
     "ControlConfig",
     "ControlStep",
-    "Cuboid",
     "DepthNoise",
     "Detour",
     "DistanceField",
@@ -174,7 +168,6 @@ __all__ = [
     "Motion",
     "MotionOutcome",
     "OccupancyGrid",
-    "OnlyDistance",
     "Perturbation",
     "PixelKind",
     "PlanDetour",
@@ -194,15 +187,12 @@ __all__ = [
     "RobotModel",
     "RobotPosture",
     "RobotSurface",
-    "Rod",
     "Scene",
     "SceneFitter",
     "SceneStep",
     "SeenVoxels",
     "Shape",
     "SimulateRequest",
-    "Solid",
-    "Solids",
     "SphereField",
     "Spheres",
     "SplatSet",
@@ -278,6 +268,7 @@ __all__ = [
     "self_mask_metrics",
     "simulate",
     "solid",
+    "solid_distance",
     "sphere_names",
     "splat_fields",
     "texture",
