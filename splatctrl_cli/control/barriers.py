@@ -99,8 +99,7 @@ class SceneRows(BarrierTerm):
     def _query(self, centers: Float64) -> tuple[Float64, Float64]:
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
-        bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
-        if np.any(bad):
+        if np.any(bad := ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))):
             first = int(np.argmax(bad))
             where = ", ".join(f"{v:.3f}" for v in points[first])
             raise NotEvaluableError(

@@ -283,18 +283,16 @@ def _line(document: Mapping[str, Any]) -> bytes:
 
 def _document(line: bytes) -> Document:
     try:
-        document = json.loads(line.decode("utf-8"), parse_int=_whole)
+        # An integer longer than any float is infinite.
+        document = json.loads(
+            line.decode("utf-8"), parse_int=lambda digits: int(digits) if len(digits) < 300 else math.inf
+        )
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
         got = shown(line[:200].decode("utf-8", "replace"))
         raise Misbehaved(Fault.NOT_JSON, f"expected a JSON object on a line, got {got!r}")
     return document
-
-
-def _whole(digits: str) -> int | float:
-    """A JSON integer; infinite if longer than any float."""
-    return int(digits) if len(digits) < 300 else math.inf
 
 
 def checked_velocity(answer: Document, limits: Mapping[str, float]) -> Float64:

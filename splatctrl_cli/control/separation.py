@@ -9,7 +9,7 @@ all joints alike. A TOML file declares the inputs (`--separation`).
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -176,6 +176,7 @@ class Approach:
 
 
 REMEDY = "see splatctrl help separation for the keys of this file"
+_refuse_if = partial(refuse_if, remedy=REMEDY, error=UsageError)
 ANYTHING, LABELLED, NEWCOMER = "anything", "labelled", "newcomer"  # surfaces that count as a person
 IGNORED, PERSON = "ignored", "person"  # space that no camera ever saw
 KEYS: Mapping[str, Mapping[str, Within | OneOf]] = {
@@ -245,19 +246,21 @@ def read_separation(path: Path, axes: Sequence[str]) -> DeclaredSeparation:
             _check_key(f"{path}: {name}", key, tuple(KEYS[name]))
             values[key] = _checked(f"{path}: {name}.{key}", KEYS[name][key], value)
     _refuse_if(
-        "intrusion" not in values, f"{path}: distance.intrusion: missing", "declare C, 0 if nothing reaches in"
+        "intrusion" not in values, f"{path}: distance.intrusion: missing", remedy="declare C, 0 if nothing reaches in"
     )
     is_newcomer = values.get("who") == NEWCOMER
     _refuse_if(
         is_newcomer != ("empty_at" in values),
         f"{path}: person.empty_at: expected with who = {NEWCOMER!r}, {'missing' if is_newcomer else 'got another'}",
-        "give the time of the log at which the cell is empty",
+        remedy="give the time of the log at which the cell is empty",
     )
     _refuse_if(
         bool(entries) == ("deceleration" in values),
         f"{path}: expected [[stop]] entries or robot.deceleration, got {'both' if entries else 'neither'}",
     )
-    _refuse_if(not isinstance(entries, list), f"{path}: stop: expected entries, got one table", "write [[stop]]")
+    _refuse_if(
+        not isinstance(entries, list), f"{path}: stop: expected entries, got one table", remedy="write [[stop]]"
+    )
     declared = DeclaredSeparation(
         **values, stops=tuple(_stop(f"{path}: stop {number}", entry) for number, entry in enumerate(entries, start=1))
     )
@@ -285,13 +288,13 @@ def _stop(where: str, entry: Any) -> StopRow:
     _refuse_if(
         not all(0 < a < b for a, b in pairwise(speed)) or speed[-1] != 1.0,
         f"{where}: speed: expected shares that rise to 1, got {list(speed)}",
-        "add the speeds that are missing, such as 0.33, 0.66 and 1.0",
+        remedy="add the speeds that are missing, such as 0.33, 0.66 and 1.0",
     )
     for key in ("time", "distance"):
         _refuse_if(
             any(b < a for a, b in pairwise(lists[key])),
             f"{where}: {key}: expected values that rise with the speed, got {list(lists[key])}",
-            "check the order of the values and their units",
+            remedy="check the order of the values and their units",
         )
     extension, payload = (_checked(f"{where}: {key}", share, entry[key]) for key in ("extension", "payload"))
     return StopRow(axis=str(entry["axis"]), extension=extension, payload=payload, **lists)
@@ -301,7 +304,9 @@ def _check_table(path: Path, declared: DeclaredSeparation, axes: Sequence[str]) 
     rows = {(row.axis, row.extension, row.payload) for row in declared.stops}
     extensions, payloads = {row.extension for row in declared.stops}, {row.payload for row in declared.stops}
     unknown = sorted({row.axis for row in declared.stops} - {*axes})
-    _refuse_if(unknown, f"{path}: stop: unknown axis {', '.join(unknown[:1])}", f"the robot has {', '.join(axes)}")
+    _refuse_if(
+        unknown, f"{path}: stop: unknown axis {', '.join(unknown[:1])}", remedy=f"the robot has {', '.join(axes)}"
+    )
     gaps = [
         (axis, extension, payload)
         for axis in axes
@@ -312,19 +317,19 @@ def _check_table(path: Path, declared: DeclaredSeparation, axes: Sequence[str]) 
     _refuse_if(
         gaps,
         f"{path}: stop: missing axis, extension, payload: {gaps and ', '.join(map(str, gaps[0]))}",
-        "declare every axis at the same extensions, up to 1, and payloads",
+        remedy="declare every axis at the same extensions, up to 1, and payloads",
     )
     _refuse_if(len(rows) < len(declared.stops), f"{path}: stop: an axis, extension and payload is given twice")
     carried = 1.0 if declared.payload is None else declared.payload
     _refuse_if(
         max(payloads) < carried,
         f"{path}: stop: expected a payload of at least {carried:g}, got {max(payloads):g} at most",
-        "add its rows, or declare robot.payload",
+        remedy="add its rows, or declare robot.payload",
     )
     _refuse_if(
         len(extensions) > 1 and declared.reach is None,
         f"{path}: robot.reach: missing, for stops by extension",
-        "give the largest extension in metres",
+        remedy="give the largest extension in metres",
     )
 
 
@@ -339,9 +344,7 @@ def _checked(where: str, declared: Within | OneOf, value: Any) -> Any:
 
 def _check_key(where: str, key: str, known: Sequence[str]) -> None:
     _refuse_if(
-        key not in known, f"{where}: unknown key {key}", did_you_mean(key, known, f"known here: {', '.join(known)}")
+        key not in known,
+        f"{where}: unknown key {key}",
+        remedy=did_you_mean(key, known, f"known here: {', '.join(known)}"),
     )
-
-
-def _refuse_if(is_bad: object, what: str, remedy: str = REMEDY) -> None:
-    refuse_if(is_bad, what, remedy=remedy, error=UsageError)

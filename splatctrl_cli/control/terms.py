@@ -164,8 +164,7 @@ def velocity_box(
         fastest_up = braking_speed(above, gain, acceleration, period)
         fastest_down = braking_speed(below, gain, acceleration, period)
     highest = np.clip(fastest_up, -velocity_limit, velocity_limit)
-    lowest = np.clip(-fastest_down, -velocity_limit, velocity_limit)
-    return lowest, highest
+    return np.clip(-fastest_down, -velocity_limit, velocity_limit), highest
 
 
 def box_rows(lowest: Float64, highest: Float64) -> Rows:

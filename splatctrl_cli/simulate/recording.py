@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, merge_by_stamp
+from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, SphereSet, merge_by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
@@ -241,7 +241,3 @@ def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robot
         radii=np.append(own.radii, radii),
     )
     return RobotModel.from_urdf(robot.urdf.path, spheres, T_world_base=robot.T_world_base)
-
-
-def _mark_shown(depth: Float32, without: Float32) -> UInt8:
-    return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

@@ -219,8 +219,7 @@ class Renderer:
         origin = self.camera.T_world_camera[:3, 3]
         owner = self._nearest(primitives, depth)
         for index, primitive in enumerate(primitives):
-            mine = owner == index
-            if mine.any():
+            if (mine := owner == index).any():
                 color[mine] = shaded(primitive, origin + depth[mine][:, None] * self._directions[mine])
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> Index:

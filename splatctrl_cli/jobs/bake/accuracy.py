@@ -25,7 +25,7 @@ from splatctrl_cli.field.incremental import Changes
 from splatctrl_cli.field.probability import probabilities
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.records import DistanceGrid, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.report.field_pictures import Reliability
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
@@ -77,10 +77,16 @@ def _compare_with_truth(
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     chunks = np.array_split(points, -(-len(points) // 50_000))  # else large (points x primitives) arrays
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
+    channels: dict[str, NDArray[np.generic]] = {
+        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
+        for name in ("sdf", "hard", "bound")
+        if name in grid.channels
+    }
+    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
     forms = probabilities(spheres, request.config.field, threads=request.threads)
     return compare_with_truth(
         points,
-        _fields(grid, drawn),
+        {"hard": exact.astype(np.float64), "sdf": channels["sdf"].astype(np.float64)},
         np.concatenate(distances),
         np.concatenate(surfaces),
         _frames(request.seen_by, source.cameras, stamp_ns),
@@ -89,17 +95,6 @@ def _compare_with_truth(
         median_radius=median_radius(grid),
         probabilities={name: form.at for name, form in forms.items()},
     )
-
-
-def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """Values of hard and sdf at drawn cells."""
-    channels: dict[str, NDArray[np.generic]] = {
-        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
-        for name in ("sdf", "hard", "bound")
-        if name in grid.channels
-    }
-    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
-    return {"hard": exact.astype(np.float64), "sdf": channels["sdf"].astype(np.float64)}
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:

@@ -411,8 +411,7 @@ class Reconstruction:
     def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:
         if posture is None or not self.declared.carried or self.robot is None:
             return
-        seconds = self._seconds(step.stamp_ns)
-        if self.declared.carried_at(seconds):
+        if self.declared.carried_at(seconds := self._seconds(step.stamp_ns)):
             for frame in step.frames:
                 mask = self_mask(frame, posture, self.config.occupancy)
                 count_carried(self.declared, frame, mask, posture, self.robot.surface_at(step.stamp_ns), seconds)

@@ -188,8 +188,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
     for link, (*corners, area) in theirs.items():
         if link not in ours:
             return f"with link {link}, which this one does not have"
-        off = np.abs(np.subtract(corners, ours[link][:-1])).max()
-        if off > fixed.SAME_LINK:
+        if (off := np.abs(np.subtract(corners, ours[link][:-1])).max()) > fixed.SAME_LINK:
             return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
         if abs(area / ours[link][-1] - 1) > fixed.SAME_LINK_AREA:
             return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"

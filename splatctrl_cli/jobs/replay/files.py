@@ -59,8 +59,7 @@ def columns_of(replay: Replay, rows: slice = slice(None)) -> Cells:
     }
     by_field = [name for field in replay.fields for name in (f"clearance_{field}", f"nearest_{field}")]
     for name in ("q", *by_field, *(name for name in COLUMNS if name in trace)):
-        values = trace.rows(name)[rows]
-        if isinstance(values, list):
+        if isinstance(values := trace.rows(name)[rows], list):
             columns[name] = values
         elif values.ndim == 1:
             columns[name] = ["" if name in OF_STEP and np.isnan(v) else v for v in values.tolist()]

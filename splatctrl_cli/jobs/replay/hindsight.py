@@ -74,8 +74,7 @@ class NewerDepth:
         stamps = np.array([stamp for stamp, _ in states])
         clearance = self._clearance_in(known_ns, stamps, np.array([q for _, q in states]))
         worst = int(clearance.argmin())
-        depth_ns = self._scene.depth_ns(known_ns)
-        if clearance[worst] < self._margin and depth_ns is not None:
+        if clearance[worst] < self._margin and (depth_ns := self._scene.depth_ns(known_ns)) is not None:
             self.found.append(
                 LaterDepth(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
             )

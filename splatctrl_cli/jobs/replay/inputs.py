@@ -105,7 +105,16 @@ def measured_robot(
         )
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
-        _check_bounded(model)
+        refuse_if(
+            model.coverage is None,
+            f"control.coverage = margin: {model.coverage_unknown}",
+            remedy="or set control.coverage = report, which needs no meshes",
+        )
+        refuse_if(
+            bare := bare_moving_links(model),
+            f"control.coverage = margin: expected spheres on every link that moves, got none on {', '.join(bare)}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
+        )
     kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
     beside = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
     model = apply_kept_margins(model, config.self_margin, kept)
@@ -188,20 +197,6 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
         )
     bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
     return words + bare
-
-
-def _check_bounded(model: RobotModel) -> None:
-    wanted = "control.coverage = margin"
-    refuse_if(
-        model.coverage is None,
-        f"{wanted}: {model.coverage_unknown}",
-        remedy="or set control.coverage = report, which needs no meshes",
-    )
-    refuse_if(
-        bare := bare_moving_links(model),
-        f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
-        remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
-    )
 
 
 def bare_moving_links(model: RobotModel) -> list[str]:

@@ -257,13 +257,10 @@ class Lockstep:
             seed=fitted.request.seed,
         )
         fitted.device.close()
-        self._console.log(self._speed())
-
-    def _speed(self) -> str:
         stamps_ns, seconds = zip(*self._taking, strict=True)
         middle, most = (f"{1e3 * float(t):.0f} ms" for t in np.percentile(seconds, [50, 99]))
         apart = f", recorded {1e-6 * float(np.median(np.diff(stamps_ns))):.0f} ms apart" if len(stamps_ns) > 1 else ""
-        return (
+        self._console.log(
             f"lockstep: {len(seconds)} frame sets{apart}, took {middle} each in the median, {most} at 99 %; their"
             f" maps are in {FOLDER}/"
         )

@@ -35,8 +35,7 @@ from splatctrl_cli.records import Float64, Stamps
 def replayed(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
-    mode = {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode]
-    return mode(request, inputs, console)
+    return {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode](request, inputs, console)
 
 
 def _audit(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:

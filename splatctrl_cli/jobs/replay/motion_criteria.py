@@ -203,8 +203,7 @@ def _brought_together(judged: Judged) -> Reason | None:
     for pair, (gap, stamp) in sorted(replay.closest.items(), key=lambda item: item[1][0] - item[0].apart):
         if pair.is_fixture or gap >= pair.apart - SLIGHTLY_UNDER:
             continue
-        before = least_gap(inputs.model, inputs.surfaces, pair, recorded)
-        if gap < before - SLIGHTLY_UNDER:
+        if gap < (before := least_gap(inputs.model, inputs.surfaces, pair, recorded)) - SLIGHTLY_UNDER:
             bound = f"at least {mm(before)}" if before < pair.apart else f"{mm(pair.apart)} or more"
             return failed(
                 sentence=f"{' and '.join(pair.links)} were driven to {mm(gap)} apart, recorded {bound}: "

@@ -50,8 +50,7 @@ class Trace(Mapping[str, Any]):
                 dtype = np.int64 if name == "stamp_ns" else np.float64
                 is_words = isinstance(values, list)
                 self._columns[name] = ObjectFile() if is_words else RowFile(values.shape[1:], dtype=dtype)
-            file = self._columns[name]
-            if isinstance(file, RowFile):
+            if isinstance(file := self._columns[name], RowFile):
                 file.append(values)
             else:
                 file.extend(values)

@@ -173,8 +173,7 @@ class _SeparationPass:
             f"{inputs.source.name}: --separation: the maps have no times",
             remedy="reconstruct with snapshots, or give --lockstep",
         )
-        seconds = np.diff(replay.trace.stamp_ns) * 1e-9
-        self._seconds = np.append(seconds, 0.0)
+        self._seconds = np.append(np.diff(replay.trace.stamp_ns) * 1e-9, 0.0)
         self.surfaces = _Surfaces(declared, inputs)
 
     def columns(self, first: int, last: int) -> NamedColumns:

@@ -297,8 +297,7 @@ class ReplayRecord:
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         nearest = part.clearance["barrier"]
         found: list[Obstacle | None] = [None] * len(part.stamp_ns)
-        states = np.flatnonzero(np.isfinite(nearest.distance))
-        if len(states):
+        if len(states := np.flatnonzero(np.isfinite(nearest.distance))):
             centers = self._model.sphere_centers_batch(part.position[states])
             points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
             obstacles = self._scene.at(int(part.stamp_ns[0])).obstacles(points)

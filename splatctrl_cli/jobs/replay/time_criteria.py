@@ -151,8 +151,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             count=len(stamps),
         )
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
-    share = float(unbounded.sum()) / duration
-    if share > config.unjudged:
+    if (share := float(unbounded.sum()) / duration) > config.unjudged:
         longest = int(np.argmax(unbounded))
         yield lacking(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "

@@ -178,10 +178,8 @@ def spread(times: list[float], when: float) -> list[int]:
     """Indices of at most 5 of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
-    count = len(times)
-    at = max((i for i, time in enumerate(times) if time <= when), default=0)
-    most = min(count, 5)
-    even = np.linspace(0, count - 1, most).round().astype(int).tolist()
+    at, most = max((i for i, time in enumerate(times) if time <= when), default=0), min(len(times), 5)
+    even = np.linspace(0, len(times) - 1, most).round().astype(int).tolist()
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
         even[nearest] = at
