@@ -15,7 +15,7 @@ from splatctrl_cli.formats.splat.splats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.jobs.compare.judged_runs import scales
 from splatctrl_cli.jobs.replay.criteria import Bound, Judged
 from splatctrl_cli.jobs.replay.evidence_criteria import BY_FEW, LIMITS, PROOF
-from splatctrl_cli.jobs.replay.verdict import CRITERIA
+from splatctrl_cli.jobs.replay.replay import CRITERIA
 from splatctrl_cli.recording.folder.image_folder import LAYOUTS
 from splatctrl_cli.recording.folder.layout import Layout
 from splatctrl_cli.voxels import EvidenceClass

@@ -6,23 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.environments import Environment, drawn, ring_of_cameras
+from experiments.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli import InputError
 from splatctrl_cli.blocks import (
     PEAK,
-    Ball,
     Clearance,
     ControlConfig,
-    Cuboid,
     Float64,
     Motion,
     PlannerConfig,
     Primitive,
     RecordingOptions,
     RobotModel,
-    Rod,
     Scene,
-    Solid,
-    Solids,
     goal_postures,
     plan,
     random_postures,

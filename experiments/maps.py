@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.gaussian_fitter import GaussianFitter
 from experiments.problems import Problem, Step, Views
+from experiments.solids import OnlyDistance
 from experiments.ways import (
     Surroundings,
     Ways,
@@ -33,7 +34,6 @@ from splatctrl_cli.blocks import (
     GridLayout,
     HasDistance,
     KnownScene,
-    OnlyDistance,
     PixelKind,
     RgbdFrame,
     RobotPosture,

@@ -1,4 +1,4 @@
-"""Figures of a path of straight edges in joint space (IV): its lengths, and the clearance proved along it.
+"""Paths of straight edges in joint space (IV): lengths, the clearance proved along one, and its last stretch.
 
 W waypoints, J joints, K samples.
 """
@@ -9,10 +9,22 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli import InputError
-from splatctrl_cli.blocks import Clearance, Float64, RobotModel, fixed, pose_error
+from splatctrl_cli.blocks import (
+    Clearance,
+    ControlConfig,
+    Float64,
+    PlannerConfig,
+    RobotModel,
+    check_edges,
+    fixed,
+    goal_postures,
+    pose_error,
+)
 
 MAX_PIECES = 200_000  # of a path, when its clearance is proved
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
+APPROACH_STEP = 0.04  # [m] between postures of a straight approach to a goal
+APPROACH_TURN = 0.5  # [rad] of a joint between two of them, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,3 +73,25 @@ def least_clearance(clearance: Clearance, waypoints: Float64, *, tolerance: floa
         edge, low, middle, high = edge[is_open], low[is_open], middle[is_open], high[is_open]
         edge, low, high = np.concatenate([edge, edge]), np.concatenate([low, middle]), np.concatenate([middle, high])
     return PathClearance(lower=lower, upper=upper, num_checks=num_checks)
+
+
+def approach_to(
+    room: Clearance, goal: Float64, *, frame: str, length: float, planner: PlannerConfig, control: ControlConfig
+) -> Float64:
+    """Postures (W, J) straight along the z axis of a goal's (J,) frame.
+
+    They start up to `length` [m] before it, as far as postures and edges are free.
+    """
+    model, way = room.model, [goal]
+    T_world_goal = model.frame_pose(goal, frame)
+    for back in np.arange(APPROACH_STEP, length + 1e-9, APPROACH_STEP):
+        T = T_world_goal.copy()
+        T[:3, 3] -= back * T[:3, 2]
+        q = goal_postures(model, frame, T, way[0][None], control, at_most=1)
+        if not len(q) or np.max(np.abs(q - way[0])) > APPROACH_TURN:
+            break
+        is_free = check_edges(room, q, way[0][None], contact=planner.contact).is_free[0]
+        if not is_free or room.at(q)[0] < planner.contact:
+            break
+        way.insert(0, q[0])
+    return np.array(way)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from experiments.drawn_task import solids_of, task_of
 from experiments.environments import ENVIRONMENTS, drawn_texture, ring_of_cameras
+from experiments.solids import Solids
 from splatctrl_cli import InputError
 from splatctrl_cli.blocks import (
     START_NS,
@@ -27,7 +28,6 @@ from splatctrl_cli.blocks import (
     Renderer,
     RgbdFrame,
     RobotModel,
-    Solids,
     arm_solids,
     arm_spheres_yaml,
     arm_urdf,

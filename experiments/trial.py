@@ -19,7 +19,7 @@ from experiments.maps import (
     splat_map,
     tsdf_map,
 )
-from experiments.paths import joint_length
+from experiments.paths import approach_to, joint_length
 from experiments.problems import Problem, ProblemRequest, Views, read_problem, views_of
 from experiments.tracking import follow_joints
 from experiments.ways import Way, plain_ways
@@ -301,7 +301,9 @@ def as_printed(rig: Rig, known: Map) -> Attempt:
 
 
 def _planned(rig: Rig, scene: HasDistance, config: Config, *, approach: float = APPROACH) -> Attempt:
-    plan = planned_path(rig.problem.model, scene, rig.task, config.planner, config.control, approach=approach)
+    planner, control = config.planner, config.control
+    ending = partial(approach_to, frame=rig.task.frame, length=approach, planner=planner, control=control)
+    plan = planned_path(rig.problem.model, scene, rig.task, planner, control, ending=ending)
     if plan.path is None:
         return Attempt(position=None, cause=BLOCKED.get(plan.outcome, judge.NO_PLAN), outcome=plan.outcome)
     position = follow_joints(plan.path, plan.clearance.model, config.control)

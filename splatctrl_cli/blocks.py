@@ -8,8 +8,7 @@ from splatctrl_cli.config.fixed import START_ROOM
 from splatctrl_cli.config.ranges import checked_pose
 from splatctrl_cli.control.audit import DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.barriers import SceneStep, rate_of
-from splatctrl_cli.control.columns import is_shaped
-from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.columns import is_shaped, runs_of
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TimedPath, guided_goal, pose_error
 from splatctrl_cli.control.replay import Outcome as MotionOutcome
 from splatctrl_cli.control.replay import ReplayTask, closed_loop, is_at_goal
@@ -55,27 +54,19 @@ from splatctrl_cli.jobs.replay.known_scene import (
 )
 from splatctrl_cli.jobs.replay.metrics import metrics_of
 from splatctrl_cli.jobs.replay.modes import replayed
+from splatctrl_cli.jobs.replay.replay import replay_verdict
 from splatctrl_cli.jobs.replay.request import ReplayInputs
-from splatctrl_cli.jobs.replay.verdict import replay_verdict
 from splatctrl_cli.jobs.running.progress import SILENT
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.kernels import native, num_threads
 from splatctrl_cli.kernels import raster as gaussian_kernels
+from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE, CYLINDER
 from splatctrl_cli.libraries import import_extra as of_extra
 from splatctrl_cli.libraries import is_installed, mpl
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import (
-    Ball,
-    Clearance,
-    Cuboid,
-    HasDistance,
-    OnlyDistance,
-    Rod,
-    Solid,
-    Solids,
-    check_edges,
-)
+from splatctrl_cli.planner.configuration_clearance import Clearance, HasDistance, check_edges
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     START_BLOCKED,
@@ -118,16 +109,19 @@ from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, depth_box
 from splatctrl_cli.simulate.arm import PEAK, Motion, arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.depth_camera import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive, Texture, Track, box, solid
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions, Scene
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE, arm_solids, cameras, furniture, texture
 from splatctrl_cli.simulate.truth import closest_of, distance_to
 from splatctrl_cli.voxels import Balls, OccupancyGrid, SeenVoxels, VoxelState
 
 __all__ = [
+    "BALL",
+    "BOX",
+    "CAPSULE",
     "CURVE_COLORS",
+    "CYLINDER",
     "GOAL_BLOCKED",
     "HALF_DIAGONAL",
     "INK",
@@ -141,7 +135,6 @@ __all__ = [
     "SURFACE_SCANS",
     "AuditRow",
     "Baker",
-    "Ball",
     "Balls",
     "Bool",
     "Camera",
@@ -149,7 +142,6 @@ __all__ = [
     "Clearance",
     "ControlConfig",
     "ControlStep",
-    "Cuboid",
     "DepthNoise",
     "Detour",
     "DistanceField",
@@ -176,7 +168,6 @@ __all__ = [
     "Motion",
     "MotionOutcome",
     "OccupancyGrid",
-    "OnlyDistance",
     "Perturbation",
     "PixelKind",
     "PlanDetour",
@@ -196,15 +187,12 @@ __all__ = [
     "RobotModel",
     "RobotPosture",
     "RobotSurface",
-    "Rod",
     "Scene",
     "SceneFitter",
     "SceneStep",
     "SeenVoxels",
     "Shape",
     "SimulateRequest",
-    "Solid",
-    "Solids",
     "SphereField",
     "Spheres",
     "SplatSet",
@@ -280,6 +268,7 @@ __all__ = [
     "self_mask_metrics",
     "simulate",
     "solid",
+    "solid_distance",
     "sphere_names",
     "splat_fields",
     "texture",

@@ -14,7 +14,7 @@ from experiments.standstill import (
     remembered,
     separation_of,
 )
-from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.columns import runs_of
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Box, Float64

@@ -30,7 +30,7 @@ from splatctrl_cli.jobs.batch.run import DONE, FAILED, describe_run
 from splatctrl_cli.jobs.batch.suite import Table
 
 PRELOADED = (  # of a runner
-    *("check", "ingest", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
+    *("check", "reconstruct.reconstruct", "export.export", "bake.bake", "score.score", "replay.replay"),
 )
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options a batch gives itself
@@ -133,10 +133,9 @@ def words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> l
     if action.nargs == 0:
         refuse_if(not isinstance(value, bool), f"{where}: expected true or false, got {value!r}", error=UsageError)
         return [name] * value
-    if isinstance(value, Mapping):
-        texts = [f"{key}={text_of(each)}" for key, each in _flat(value)]
-    else:
-        texts = [text_of(each) for each in (value if isinstance(value, list) else [value])]
+    several = value if isinstance(value, list) else [value]
+    is_table = isinstance(value, Mapping)
+    texts = [f"{key}={text_of(each)}" for key, each in _flat(value)] if is_table else [*map(text_of, several)]
     if action.type is Path:
         texts = [str(folder / text) for text in texts]
     if name and not isinstance(action, argparse._AppendAction):

@@ -41,9 +41,8 @@ def _row(result: CalibrateResult, name: str) -> list[object]:
     camera, (distance, angle) = result.calibration.cameras[name], result.moved[name]
     unobserved = "; ".join(f"not observed: {text}" for text in camera.unobserved)
     remark = "held" if result.calibration.is_held(name) else unobserved
-    depth = "as recorded"
-    if math.isfinite(camera.depth_noticed[1]):
-        depth += f" ({1e3 * camera.depth_noticed[1]:.0f} mm off would show)"
+    noticed = 1e3 * camera.depth_noticed[1]
+    depth = "as recorded" + (f" ({noticed:.0f} mm off would show)" if math.isfinite(noticed) else "")
     if (camera.scale, camera.bias) != (1.0, 0.0):
         depth = f"x {camera.scale:.4f}" + (f" {1e3 * camera.bias:+.1f} mm" if camera.bias else "")
     return [

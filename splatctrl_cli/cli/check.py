@@ -9,8 +9,7 @@ from splatctrl_cli.cli.common import Console, format_cell, remarks, request_of, 
 from splatctrl_cli.errors import DAMAGED
 from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.ingest import IngestRequest, ingest
+from splatctrl_cli.jobs.check import CheckRequest, IngestRequest, check, ingest
 from splatctrl_cli.recording.source import describe
 from splatctrl_cli.recording.source_options import SourceOptions
 

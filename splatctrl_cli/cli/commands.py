@@ -231,7 +231,7 @@ COMMANDS = {
             "score out/scene --reference out/x.capture --cameras cam3 -o out/score",
             "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",
         ),
-        run="score:run",
+        run="reconstruct:run_score",
         judges=True,
         options=scene_options.SCORE,
     ),

@@ -15,7 +15,7 @@ from splatctrl_cli.cli.parser import Adds, group, join_run_options, option, real
 from splatctrl_cli.cli.reports import report_command, wrap_result
 from splatctrl_cli.config import PRESETS, Config, fixed, load_config
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, checked_pose, format_value
-from splatctrl_cli.errors import UsageError, refuse_if
+from splatctrl_cli.errors import UsageError, refuse_faults, refuse_if
 from splatctrl_cli.evaluate.verdict import JudgedResult, Result, gate
 from splatctrl_cli.files.output import plain
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS, CameraTopics
@@ -80,10 +80,8 @@ def names_of(option: str, choices: Sequence[str], text: str) -> tuple[str, ...]:
 
 
 def pose(text: str) -> tuple[float, ...]:
-    try:
+    with refuse_faults(str, ValueError, error=argparse.ArgumentTypeError):
         return checked_pose(numbers(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _device(text: str) -> str:
@@ -133,10 +131,6 @@ def _human_topic(text: str) -> tuple[str, str]:
     name, _, topic = text.partition("=")
     refuse_if(not name or not topic, f"--human-topic {text}: expected NAME=TOPIC", error=UsageError)
     return name, topic
-
-
-def _is_topic(text: str) -> bool:
-    return text.partition("=")[2].startswith("/")
 
 
 def _pose(text: str) -> tuple[str, tuple[float, ...]]:
@@ -252,8 +246,8 @@ SOURCE = (  # the options of a source, all but --cameras in a group of their own
             "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or"
             " of FRAME's",
             fields={
-                "camera_poses": lambda texts: dict(_pose(text) for text in texts if not _is_topic(text)),
-                "camera_pose_topics": lambda texts: dict(_pose_topic(text) for text in texts if _is_topic(text)),
+                "camera_poses": lambda texts: dict(_pose(text) for text in texts if "=/" not in text),
+                "camera_pose_topics": lambda texts: dict(_pose_topic(text) for text in texts if "=/" in text),
             },
         ),
         option(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn, TypeVar
 
 from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, format_value
-from splatctrl_cli.errors import UsageError, did_you_mean
+from splatctrl_cli.errors import UsageError, did_you_mean, refuse_faults, refuse_if
 
 T = TypeVar("T", int, float)
 
@@ -219,9 +219,8 @@ def invocation(action: argparse.Action) -> str:
     names = ", ".join(action.option_strings)
     if action.nargs == 0:
         return names
-    if action.choices:
-        return f"{names} {{{','.join(map(str, action.choices))}}}"
-    return f"{names} {action.metavar or action.dest.upper()}"
+    choices = f"{{{','.join(map(str, action.choices or ()))}}}"
+    return f"{names} {choices if action.choices else action.metavar or action.dest.upper()}"
 
 
 def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
@@ -246,12 +245,9 @@ def several(text: str) -> tuple[float, ...]:
 def _parse_within(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
     def parse(text: str) -> T:
         what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {format_value(text)}"
-        try:
+        with refuse_faults(lambda _: what, ValueError, error=argparse.ArgumentTypeError):
             value = kind(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(what) from None
-        if not declared.holds(value):
-            raise argparse.ArgumentTypeError(what)
+        refuse_if(not declared.holds(value), what, error=argparse.ArgumentTypeError)
         return value
 
     return parse

@@ -317,10 +317,6 @@ MODES = ("audit", "open-loop", "closed-loop")
 STEP_LIMIT = 10.0  # [s]
 
 
-def _start(text: str) -> float | str:
-    return text if text == "first-map" else real(0, MAX_SECONDS, "s or first-map")(text)
-
-
 REPLAY = (  # what people use, and in groups the rest
     option("LOG", "a log or capture with joint states", Path),
     either(
@@ -332,7 +328,11 @@ REPLAY = (  # what people use, and in groups the rest
     option("--urdf FILE", "the robot's URDF (default: the log's own robot_description)", Path),
     option("--spheres FILE.yaml", "its spheres (default: the URDF's own)", Path),
     option("--mode", "what to replay", MODES, "audit"),
-    option("--start-time S", "start at this time of the log [s], or first-map: at the first map", _start),
+    option(
+        "--start-time S",
+        "start at this time of the log [s], or first-map: at the first map",
+        lambda text: text if text == "first-map" else real(0, MAX_SECONDS, "s or first-map")(text),
+    ),
     option("--truth FILE", "truth.json of a simulated log", Path),
     option(
         "--evidence CAMERA|K",

@@ -51,17 +51,18 @@ def _truth_lines(compared: Mapping[str, Any]) -> list[str]:
         for where, place in (("seen", "seen"), ("all", "everywhere"))
         for name, band in _each(compared[place])
     ]
-    verdict = (
-        f"hard exceeds the truth by more than {over['allowance'] * 1e3:.1f} mm at {over['count_beyond']} of "
-        f"{over['count']} seen cells"
-    )
+    beyond = ""
     if over["median_beyond"] is not None and over["max_error"] is not None:
-        verdict += (
+        beyond = (
             f": in the median by {over['median_beyond'] * 1e3:.1f} mm more than that; "
             f"the largest error is {over['max_error'] * 1e3:.1f} mm"
         )
-    if outside := compared["num_outside_workspace"]:
-        verdict += f"; {outside} cells before seen surfaces outside the workspace do not count"
+    outside = compared["num_outside_workspace"]
+    verdict = (
+        f"hard exceeds the truth by more than {over['allowance'] * 1e3:.1f} mm at {over['count_beyond']} of "
+        f"{over['count']} seen cells{beyond}"
+        + (f"; {outside} cells before seen surfaces outside the workspace do not count" if outside else "")
+    )
     expected = [
         f"probability, {name}: calibration error {curve['calibration_error']:.3f} at seen cells"
         for name, curve in compared["reliability"].items()

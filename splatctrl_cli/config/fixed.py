@@ -203,8 +203,7 @@ SHORTCUT_WORTH = 1e-3  # [rad] that a shortcut has to save
 STILL_ROW = 1e-9  # [m] a row that an edge does not move is taken to lose this much
 SHORTEST_EDGE = 1e-9  # [rad] that the search for where an edge stops being free goes down to
 FRAME_SPACING = 0.05  # [rad] of the samples that the speed of a frame is looked at
-APPROACH_STEP = 0.04  # [m] between postures of a straight approach to a goal
-APPROACH_TURN = 0.5  # [rad] of a joint between two of them, at most
+
 START_ROOM = 1e-3  # [m] left to move in where the start or goal stands within a margin
 GOAL_GUESSES = 2  # per goal posture that is looked for
 GOAL_STEPS = 30  # of a guess: with 100, a fifth more guesses end at the pose, in 2.6 times the time

@@ -101,7 +101,12 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
     ]:
         _check_known(name, PRESETS, "--preset", "")
         yield from ((f"--preset {name}", section, values) for section, values in PRESETS[name].items())
-    for section, values in ({} if path is None else _read_toml(path)).items():
+    with (
+        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy="give an existing TOML file"),
+        refuse_faults(f"{path}: not valid TOML", ValueError, error=UsageError),  # UTF-8 and too long integers, too
+    ):
+        document = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
+    for section, values in document.items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         refuse_if(
             not isinstance(values, dict),
@@ -150,14 +155,6 @@ def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> 
         raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
-    with (
-        refuse_faults(lambda _: f"{path}: no such file", FileNotFoundError, remedy="give an existing TOML file"),
-        refuse_faults(f"{path}: not valid TOML", ValueError, error=UsageError),  # UTF-8 and too long integers, too
-    ):
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-
-
 def _parse_value(text: str) -> Any:
     try:
         parsed = tomllib.loads(f"value = {text}")
@@ -183,9 +180,8 @@ def _has_type(value: Any, hint: Any) -> Any:
     if isinstance(value, list) and tuple[float, ...] in options:
         numbers = tuple(_has_type(item, float) for item in value)
         return numbers if all(type(number) is float for number in numbers) else value
-    if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
-        return float(value)
-    return value
+    is_float = float in options and type(value) is int and abs(value) < 1 << 1023  # what a float holds
+    return float(value) if is_float else value
 
 
 DEFAULT = "default"

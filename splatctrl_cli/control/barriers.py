@@ -8,8 +8,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.limits import braking_speed
-from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
+from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State, braking_speed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
@@ -100,8 +99,7 @@ class SceneRows(BarrierTerm):
     def _query(self, centers: Float64) -> tuple[Float64, Float64]:
         points = np.ascontiguousarray(centers[self._moving])
         distance, gradient = self._field.query(points)
-        bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
-        if np.any(bad):
+        if np.any(bad := ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))):
             first = int(np.argmax(bad))
             where = ", ".join(f"{v:.3f}" for v in points[first])
             raise NotEvaluableError(

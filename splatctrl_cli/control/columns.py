@@ -1,6 +1,8 @@
-"""Named columns of audited states and of a controller's steps."""
+"""Columns of a trace, from states and a controller's steps, and the events in them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
 from typing import Any
 
@@ -10,7 +12,7 @@ from splatctrl_cli.control.audit import AuditTrace
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.records import Float64, Index
+from splatctrl_cli.records import Bool, Float64, Index, Stamps
 
 NamedColumns = Mapping[str, Any]
 """Columns by name: arrays (T, ...) with NaN for no value, or T words or tuples of words, empty for none."""
@@ -102,3 +104,220 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedC
             tuple(row.name for row in sorted(rows, key=lambda row: -row.multiplier)) for rows in own
         ]
     return columns
+
+
+UNREPRESENTED = "unrepresented voxel"  # label of an occupied voxel without a splat
+MAX_NAMES = 12  # listed per event; num_names counts all
+
+
+class EventKind(StrEnum):
+    """Kind of an event; the comment describes its worst value."""
+
+    BELOW_MARGIN = "below-margin"  # least clearance [m]
+    IN_COLLISION = "in-collision"  # least clearance [m]
+    WITHOUT_DISTANCE = "without-distance"  # number of fields without a distance
+    UNKNOWN_SPACE = "unknown-space"  # largest share of sphere centres
+    BETWEEN_STATES = "between-states"  # least bound [m] of the clearance since the state before
+    NOT_BOUNDED = "not-bounded"  # longest time [s] without a bound on the arm's place
+    SELF_COLLISION = "self-collision"  # least distance of two spheres of the arm [m]
+    OUTSIDE_LIMITS = "outside-limits"  # least distance to the limit, negative [rad]
+    TOO_FAST = "too-fast"  # largest velocity, as a share of its limit
+    TOO_SUDDEN = "too-sudden"  # largest acceleration, as a share of its limit
+    STALE_MAP = "stale-map"  # oldest scene [s]
+    SCENE = "scene"  # largest multiplier of a row against the scene
+    SELF = "self"  # likewise, of a self-collision row
+    LIMIT = "limit"  # likewise, of a joint's position or velocity limit
+    RELAXED = "relaxed"  # largest slack [m/s]
+    MINIMUM_VIOLATION = "minimum-violation"  # largest residual
+    HOLD = "hold"  # least barrier clearance [m]
+    SCALED_BACK = "scaled-back"  # least scale
+    ROW_BROKEN = "row-broken"  # largest excess over a barrier row by an external controller [m/s]
+    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that no joint moves
+
+
+UNITS = {  # of a kind's worst value, if it has one
+    **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
+    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s", "row-broken": "m/s"},
+}
+INTERVENTIONS = frozenset(
+    {
+        *(EventKind.SCENE, EventKind.SELF, EventKind.LIMIT, EventKind.RELAXED),
+        *(EventKind.MINIMUM_VIOLATION, EventKind.HOLD, EventKind.SCALED_BACK),
+    }
+)
+"""Kinds in which the controller did not follow its goal."""
+
+SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events, and their label
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """Nearest obstacle: distance [m] of its surface to a point; place (3,) [m], world.
+
+    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of others.
+    """
+
+    distance: float
+    position: tuple[float, float, float]
+    splat: int | None = None
+    label: str | None = None
+    cell: tuple[int, int, int] | None = None
+    name: str = ""
+
+    def __str__(self) -> str:
+        where = ", ".join(f"{v:.3f}" for v in self.position)
+        unit = UNREPRESENTED if self.label == UNREPRESENTED else f"cell {self.cell}"
+        what = unit if self.splat is None else f"{self.label} splat {self.splat}"
+        return f"{self.name or what} at ({where})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """An interval of successive states with its worst value.
+
+    names: in order, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the worst state;
+    worst_name, obstacle: there.
+    """
+
+    kind: EventKind
+    source: str
+    first_ns: int
+    last_ns: int
+    start_s: float
+    end_s: float
+    num_states: int
+    worst: float
+    worst_s: float
+    state: int
+    worst_name: str
+    names: tuple[str, ...]
+    num_names: int
+    obstacle: Obstacle | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """Source of events of one kind, by state: is_on (T,), value (T,), who (T,).
+
+    who: a name, or names, the value's own first.
+    """
+
+    kind: EventKind
+    is_on: Bool
+    value: Float64
+    who: Sequence[str | tuple[str, ...]] = ()
+    is_high_worse: bool = True
+    source: str = ""
+
+    def names(self, first: int, end: int) -> list[str]:
+        """Names at states [first, end), each once, in order."""
+        there = [(who,) if isinstance(who, str) else who for who in self.who[first:end]]
+        return list(dict.fromkeys(name for names in there for name in names))
+
+
+def runs_of(is_on: Bool) -> list[tuple[int, int]]:
+    """First and one past the last index of each run of true values (T,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_on, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+Near = Callable[[EventKind, str, int], Obstacle | None]
+"""Kind of an event, name of its worst and at which of the states -> what is nearest there."""
+
+
+def events_of(stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> tuple[Event, ...]:
+    """Intervals of all signals (T,), by start; near: the obstacle of a worst value."""
+    runs = [(signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
+    runs.sort(key=lambda run: (stamp_ns[run[1]], -stamp_ns[run[2] - 1]))
+    return tuple(_event(stamp_ns, signal, first, end, near) for signal, first, end in runs)
+
+
+def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> Event:
+    """The event of the states [first, end)."""
+    values = signal.value[first:end]
+    at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
+    start_s, end_s, worst_s = (float(stamp_ns[i] - stamp_ns[0]) * 1e-9 for i in (first, end - 1, at))
+    names, name = signal.names(first, end), next(iter(signal.names(at, at + 1)), "")
+    return Event(
+        kind=signal.kind,
+        source=signal.source,
+        first_ns=int(stamp_ns[first]),
+        last_ns=int(stamp_ns[end - 1]),
+        start_s=start_s,
+        end_s=end_s,
+        num_states=end - first,
+        worst=float(signal.value[at]),
+        worst_s=worst_s,
+        state=at,
+        worst_name=name,
+        names=tuple(names[:MAX_NAMES]),
+        num_names=len(names),
+        obstacle=None if near is None else near(signal.kind, name, at),
+    )
+
+
+def first_intervention(events: Sequence[Event]) -> Event | None:
+    """Earliest event in which the controller deviated from its request."""
+    return next((event for event in events if event.kind in INTERVENTIONS), None)
+
+
+def clearance_signals(columns: NamedColumns, source: str, margin: float) -> list[Signal]:
+    """Signals of a field's clearance (T,) [m]: below the margin, in contact, unknown."""
+    distance, who = columns[f"clearance_{source}"], columns[f"nearest_{source}"]
+    low = partial(Signal, value=distance, who=who, is_high_worse=False, source=source)
+    is_blank = np.isnan(distance)
+    return [
+        low(kind=EventKind.BELOW_MARGIN, is_on=distance < margin),
+        low(kind=EventKind.IN_COLLISION, is_on=distance < 0),
+        Signal(kind=EventKind.WITHOUT_DISTANCE, is_on=is_blank, value=is_blank * 1.0, who=who, source=source),
+    ]
+
+
+def audit_signals(columns: NamedColumns, fields: Sequence[str], margin: float) -> list[Signal]:
+    """Signals of audited states: clearance by each field, known space, limits, self-collision."""
+    unknown, outside, touching = (columns[name] for name in ("unknown_share", "limit_margin", "self_clearance"))
+    low = partial(Signal, is_high_worse=False)
+    return [
+        *(signal for field in fields for signal in clearance_signals(columns, field, margin)),
+        Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown),
+        low(kind=EventKind.OUTSIDE_LIMITS, is_on=outside < 0, value=outside, who=columns["limit_joint"]),
+        low(kind=EventKind.SELF_COLLISION, is_on=touching < 0, value=touching, who=columns["self_pair"]),
+    ]
+
+
+def motion_signals(columns: NamedColumns, margin: float, max_map_age: float) -> list[Signal]:
+    """Signals of motion and time: limits exceeded, clearance [m] between states, old maps [s]."""
+    fast, sudden, lower = (columns[name] for name in ("velocity_share", "acceleration_share", "clearance_between"))
+    unbounded, age = columns["unbounded_s"], columns["map_age_s"]
+    return [
+        Signal(kind=EventKind.TOO_FAST, is_on=fast > 1, value=fast, who=columns["velocity_joint"]),
+        Signal(kind=EventKind.TOO_SUDDEN, is_on=sudden > 1, value=sudden, who=columns["acceleration_joint"]),
+        Signal(kind=EventKind.BETWEEN_STATES, is_on=lower < margin, value=lower, is_high_worse=False),
+        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded),
+        Signal(kind=EventKind.STALE_MAP, is_on=age > max_map_age, value=age),
+    ]
+
+
+def step_signals(columns: NamedColumns) -> list[Signal]:
+    """Signals of a controller's steps: rows that shaped them, fallbacks, broken rows."""
+    rung, scale, slack = np.array(columns["rung"]), columns["scale"], columns["slack"]
+    is_least, is_hold, is_outside = (rung == each for each in (Rung.MINIMUM_VIOLATION, Rung.HOLD, Rung.OUTSIDE))
+    cannot_act = np.array([len(names) > 0 for names in columns["who_fixed"]])
+    by_slack = partial(Signal, value=slack, who=columns["who_relaxed"])
+    at_nearest = partial(Signal, who=columns["barrier_nearest"])
+    rows = ((kind, columns[f"multiplier_{kind}"], columns[f"who_{kind}"]) for kind in RowKind)
+    return [
+        *(Signal(kind=EventKind(kind.value), is_on=value > 0, value=value, who=who) for kind, value, who in rows),
+        by_slack(kind=EventKind.RELAXED, is_on=(slack > 0) & ~is_outside),
+        by_slack(kind=EventKind.ROW_BROKEN, is_on=(slack > 0) & is_outside),
+        at_nearest(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=columns["residual"]),
+        at_nearest(kind=EventKind.HOLD, is_on=is_hold, value=columns["barrier_clearance"], is_high_worse=False),
+        at_nearest(kind=EventKind.SCALED_BACK, is_on=(scale < 1) & ~is_hold, value=scale, is_high_worse=False),
+        Signal(
+            kind=EventKind.CANNOT_ACT,
+            is_on=cannot_act,
+            value=columns["fixed_distance"],
+            who=columns["who_fixed"],
+            is_high_worse=False,
+        ),
+    ]

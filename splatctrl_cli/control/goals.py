@@ -162,9 +162,8 @@ class TwistTrack:
     def at(self, stamp_ns: int, timeout: float) -> Float64:
         """Newest twist (6,) up to a stamp [ns]; zero if none or older than `timeout` [s]."""
         index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
-        if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
-            return np.zeros(6)
-        return np.asarray(self.twist[index])
+        is_old = index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout
+        return np.zeros(6) if is_old else np.asarray(self.twist[index])
 
     def is_known(self, stamp_ns: Stamps, timeout: float) -> Bool:
         """True for stamps (T,) with a current twist."""

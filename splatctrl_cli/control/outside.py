@@ -7,16 +7,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
 from splatctrl_cli.control.step import Commander, ControlStep, Moment, QpIkController, View
-from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.control.terms import JointLimits, RowKind
 from splatctrl_cli.control.user_controller import PROTOCOL
 from splatctrl_cli.errors import InputError, refuse_faults
 from splatctrl_cli.records import Float64, Stamps
@@ -118,16 +118,13 @@ class Program(LineProcess):
         self.clock.spent, has_rows = 0.0, False
         line = _line({"id": self._num} | question)
         while True:
-            answer = self._ask(line)
+            answer = _document(self.clock.measure(partial(self.exchange, line)))
             if answer.get("id") != self._num:
                 got = shown(repr(answer.get("id")))
                 raise Misbehaved(Fault.OUT_OF_TURN, f"expected the answer to id {self._num}, got one to {got}")
             if answer.get("ask") != "rows" or has_rows:
                 return checked_velocity(answer, limits)
             line, has_rows = _line({"rows": rows()}), True
-
-    def _ask(self, line: bytes) -> Document:
-        return _document(self.clock.measure(lambda limit: self.exchange(line, limit)))
 
 
 class RecordedCommands:
@@ -210,8 +207,7 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         limits = dict(zip(self._model.joint_names, self._model.velocity_limit.tolist(), strict=True))
         velocity, *others = [program.velocity(question, rows, limits) for program in self._programs]
         for other in others:
-            differs = np.flatnonzero(velocity != other)
-            if len(differs):
+            if len(differs := np.flatnonzero(velocity != other)):
                 joint = int(differs[0])
                 name, values = self._model.joint_names[joint], (float(velocity[joint]), float(other[joint]))
                 raise Misbehaved(
@@ -287,18 +283,16 @@ def _line(document: Mapping[str, Any]) -> bytes:
 
 def _document(line: bytes) -> Document:
     try:
-        document = json.loads(line.decode("utf-8"), parse_int=_whole)
+        # An integer longer than any float is infinite.
+        document = json.loads(
+            line.decode("utf-8"), parse_int=lambda digits: int(digits) if len(digits) < 300 else math.inf
+        )
     except (ValueError, RecursionError):
         document = None
     if not isinstance(document, dict):
         got = shown(line[:200].decode("utf-8", "replace"))
         raise Misbehaved(Fault.NOT_JSON, f"expected a JSON object on a line, got {got!r}")
     return document
-
-
-def _whole(digits: str) -> int | float:
-    """A JSON integer; infinite if longer than any float."""
-    return int(digits) if len(digits) < 300 else math.inf
 
 
 def checked_velocity(answer: Document, limits: Mapping[str, float]) -> Float64:

@@ -156,8 +156,7 @@ class PolicyClient:
         self.clock.spent = 0.0
         if not self._chunk:
             observation = self._msgpack.packb(self._observe(question), default=pack_array)
-            answer = self.clock.measure(lambda limit: self._exchange(observation, limit))
-            self._chunk = self._actions(answer)
+            self._chunk = self._actions(self.clock.measure(lambda limit: self._exchange(observation, limit)))
         action = self._chunk.pop(0)
         if len(action) == self._num_joints + 1:  # the last is a gripper's
             action = action[:-1]

@@ -23,39 +23,39 @@ class StaticViolation:
 
 def check_model(model: RobotModel) -> None:
     """Raise InputError for a robot without velocity limits or moving spheres."""
-    has_limit = np.asarray(model.velocity_limit) > 0
-    if not np.all(has_limit):
-        joint = int(np.argmin(has_limit))
-        raise InputError(
-            f"joint {model.joint_names[joint]}: expected a velocity limit above zero, "
-            f"got {model.velocity_limit[joint]:g}",
-            remedy="set it in the URDF's <limit velocity=...>",
-        )
     refuse_if(
         not np.any(model.moving_spheres), "robot: no collision sphere moves with a joint", remedy="check --spheres"
+    )
+    joint = int(np.argmin(np.asarray(model.velocity_limit) > 0))  # the first without a limit
+    refuse_if(
+        not model.velocity_limit[joint] > 0,
+        f"joint {model.joint_names[joint]}: expected a velocity limit above zero, "
+        f"got {model.velocity_limit[joint]:g}",
+        remedy="set it in the URDF's <limit velocity=...>",
     )
 
 
 def check_coverage(model: RobotModel, config: ControlConfig) -> None:
     """Raise InputError if rows should compensate for uncovered surface that was not measured."""
     unknown = np.isnan(model.sphere_deficit) & np.asarray(model.moving_spheres)
-    if config.coverage == "margin" and np.any(unknown):
-        name = sphere_names(model.sphere_set)[int(np.argmax(unknown))]
-        raise InputError(
-            f"control.coverage = margin: sphere {name}: expected a measured coverage of its body, got none",
-            remedy="give a URDF whose collision geometry can be read, or set control.coverage = report",
-        )
+    name = sphere_names(model.sphere_set)[int(np.argmax(unknown))]
+    refuse_if(
+        config.coverage == "margin" and np.any(unknown),
+        f"control.coverage = margin: sphere {name}: expected a measured coverage of its body, got none",
+        remedy="give a URDF whose collision geometry can be read, or set control.coverage = report",
+    )
 
 
 def checked_posture(model: RobotModel, q: Float64, *, what: str = "joint positions") -> Float64:
     """q as (J,) float64. Raises InputError for another size or a non-finite value."""
-    posture = np.asarray(q, dtype=np.float64)
-    if posture.shape != (len(model.joint_names),):
-        names = ", ".join(model.joint_names)
-        raise InputError(f"{what}: expected {len(model.joint_names)} joints ({names}), got shape {posture.shape}")
+    posture, names = np.asarray(q, dtype=np.float64), model.joint_names
+    refuse_if(
+        posture.shape != (len(names),),
+        f"{what}: expected {len(names)} joints ({', '.join(names)}), got shape {posture.shape}",
+    )
     if not np.all(np.isfinite(posture)):
         joint = int(np.argmin(np.isfinite(posture)))
-        raise InputError(f"{what}: joint {model.joint_names[joint]} is {posture[joint]}, expected a finite angle")
+        raise InputError(f"{what}: joint {names[joint]} is {posture[joint]}, expected a finite angle")
     return posture
 
 
@@ -83,12 +83,13 @@ def check_free(
     if distance_to is not None and (distance < 0).any():
         distance = part_clearances(model, q[None], distance_to)[0][0]
     worst = int(np.argmin(np.where(np.isfinite(distance), distance, np.inf)))
-    if distance[worst] < 0:
-        name = sphere_names(model.sphere_set)[moving[worst]]
-        raise NotEvaluableError(
-            f"start: expected a posture free of collision, got sphere {name} {-distance[worst]:.4f} m deep in it",
-            remedy="choose another --start-time, or check the robot's labels in the scene and --base",
-        )
+    name = sphere_names(model.sphere_set)[moving[worst]]
+    refuse_if(
+        distance[worst] < 0,
+        f"start: expected a posture free of collision, got sphere {name} {-distance[worst]:.4f} m deep in it",
+        remedy="choose another --start-time, or check the robot's labels in the scene and --base",
+        error=NotEvaluableError,
+    )
 
 
 def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
@@ -98,12 +99,12 @@ def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
         "goal: expected a finite pose x,y,z,qx,qy,qz,qw",
     )
     distance = float(np.linalg.norm(T_world_goal[:3, 3] - model.base_position))
-    if distance > model.reach():
-        where = ", ".join(f"{v:.3f}" for v in T_world_goal[:3, 3])
-        raise InputError(
-            f"goal: expected within {model.reach():.3f} m of the base, got ({where}) at {distance:.3f} m",
-            remedy="give a nearer --goal, or check --base and the world frame",
-        )
+    where = ", ".join(f"{v:.3f}" for v in T_world_goal[:3, 3])
+    refuse_if(
+        distance > model.reach(),
+        f"goal: expected within {model.reach():.3f} m of the base, got ({where}) at {distance:.3f} m",
+        remedy="give a nearer --goal, or check --base and the world frame",
+    )
 
 
 def static_violations(

@@ -10,8 +10,7 @@ import numpy as np
 from scipy import sparse
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.limits import box_rows
-from splatctrl_cli.control.terms import Barrier, Cost, stray_cost, sum_costs
+from splatctrl_cli.control.terms import Barrier, Cost, box_rows, stray_cost, sum_costs
 from splatctrl_cli.records import Float64
 
 

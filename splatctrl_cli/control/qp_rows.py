@@ -13,9 +13,8 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.barriers import SceneRows, SelfRows, can_bind
-from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import Choice, QpSolver, QuadraticProgram, Rung, is_usable, stand_still
-from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, configured_weights
+from splatctrl_cli.control.terms import NO_SPHERE, Barrier, BarrierTerm, Cost, State, box_rows, configured_weights
 from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
 from splatctrl_cli.robot.model import RobotModel
 

@@ -127,8 +127,7 @@ def closed_loop(
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
-        logged = course.anchor(index, stamp)
-        if logged is not None:
+        if (logged := course.anchor(index, stamp)) is not None:
             q, last_velocity = logged
             anchored.append(index)
         if field_at(stamp) is not field:
@@ -188,9 +187,9 @@ class _Course:
     def anchor(self, index: int, stamp_ns: int) -> tuple[Float64, Float64] | None:
         """Logged position and velocity (J,) at each later anchor period, until the log ends."""
         task = self._task
-        if task.anchors is None or index == 0 or task.anchor_period <= 0:
-            return None
-        if index % max(round(task.anchor_period / self._config.period), 1) or stamp_ns > task.anchors.last_ns:
+        num_steps = max(round(task.anchor_period / self._config.period), 1)
+        is_due = task.anchor_period > 0 and index > 0 and index % num_steps == 0
+        if task.anchors is None or not is_due or stamp_ns > task.anchors.last_ns:
             return None
         self._since = index
         return task.anchors.at(stamp_ns)

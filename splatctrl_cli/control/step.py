@@ -9,7 +9,6 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig, fixed
 from splatctrl_cli.control.audit import BallDistance
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
-from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
 from splatctrl_cli.control.qp import SOLVERS, Choice, QpSolver, Rung, descend, stand_still, unsolved
 from splatctrl_cli.control.qp_rows import PRINTED, RowBuilder, Rows, solve_printed
@@ -17,6 +16,7 @@ from splatctrl_cli.control.terms import (
     BarrierTerm,
     Cost,
     CostTerm,
+    JointLimits,
     RowKind,
     State,
     configured_weights,

@@ -71,7 +71,8 @@ class ControllerInput:
 
     q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
     in a second, linear first; jacobian (6, J) of the frame. goal_twist (6,) [m/s, rad/s], goal_posture (J,) [rad] and
-    its goal_velocity (J,) [rad/s] are None for a pose alone.
+    its goal_velocity (J,) [rad/s] are None for a pose alone. rows() returns our controller's rows: moving spheres,
+    and pairs that an allowed velocity could violate.
     """
 
     stamp_ns: int
@@ -84,11 +85,7 @@ class ControllerInput:
     pose: Float64
     error: Float64
     jacobian: Float64
-    ask_rows: Callable[[], Sequence[ClearanceRow]] = field(repr=False)
-
-    def rows(self) -> Sequence[ClearanceRow]:
-        """Our controller's rows: moving spheres, and pairs that an allowed velocity could violate."""
-        return self.ask_rows()
+    rows: Callable[[], Sequence[ClearanceRow]] = field(repr=False)
 
 
 class Controller(Protocol):
@@ -114,8 +111,7 @@ def serve(target: str) -> None:
         answers.flush()
 
     def line() -> dict[str, Any]:
-        text = questions.readline()
-        if not text:
+        if not (text := questions.readline()):
             sys.exit(0)
         document: dict[str, Any] = json.loads(text)
         return document
@@ -133,7 +129,7 @@ def serve(target: str) -> None:
             return known[0]
 
         arrays = {name: _array(asked[name]) for name in ARRAYS}
-        now = ControllerInput(stamp_ns=asked["stamp_ns"], ask_rows=rows, **arrays)
+        now = ControllerInput(stamp_ns=asked["stamp_ns"], rows=rows, **arrays)
         answer(id=asked["id"], velocity=_velocities(target, controller.step(now)))
 
 

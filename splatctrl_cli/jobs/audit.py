@@ -30,9 +30,8 @@ from splatctrl_cli.jobs.replay.replay import check_request, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import write_page_of_runs
 from splatctrl_cli.jobs.robot.logged_robot import installed_urdf, logged_urdf
-from splatctrl_cli.jobs.running.device import AUTO, RunOptions
+from splatctrl_cli.jobs.running.device import RunOptions, deciding_versions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import deciding_versions
 from splatctrl_cli.jobs.runs.run_folder import open_run, read_object
 from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.source import open_source
@@ -72,8 +71,6 @@ class AuditRequest(RunOptions):
     goal: tuple[float, ...] | None = None
     goal_joints: tuple[float, ...] | None = None
     frame: str | None = None
-    device: str = AUTO
-    seed: int = 0
     resume: bool = False
     words: tuple[str, ...] = ()
 
@@ -117,7 +114,13 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
     source = open_source(request.log, request.options)
     if request.robot is not None:
         request = replace(request, urdf=installed_urdf(request.robot))
-    urdf = _read_robot(request, is_needed=bool(source.joint_names))
+    urdf = logged_urdf([request.log]) if request.urdf is None else read_urdf(request.urdf)
+    refuse_if(
+        source.joint_names and urdf is None,
+        f"audit: {request.log} does not describe the robot",
+        remedy="give it with --urdf FILE or --robot NAME",
+        error=UsageError,
+    )
     digests = {**source.digests(), **_digests(request, urdf)}
     lacks_spheres = urdf is not None and request.spheres is None and not len(own_spheres(urdf).radii)
     request = replace(request, spheres=request.out / SPHERES) if lacks_spheres else request
@@ -154,17 +157,6 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
     )
     document = {"out": request.out, "page": request.out / PAGE, "made": [*steps.stopwatch.seconds]}
     return JudgedResult(out=request.out, document=document, verdict=verdict)
-
-
-def _read_robot(request: AuditRequest, *, is_needed: bool) -> UrdfFile | None:
-    urdf = logged_urdf([request.log]) if request.urdf is None else read_urdf(request.urdf)
-    refuse_if(
-        is_needed and urdf is None,
-        f"audit: {request.log} does not describe the robot",
-        remedy="give it with --urdf FILE or --robot NAME",
-        error=UsageError,
-    )
-    return urdf
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:

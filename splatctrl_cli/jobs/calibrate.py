@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,11 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import finite, output_path
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.jobs.check import pose_robot
+from splatctrl_cli.jobs.check import SessionRequest, pose_robot
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_session
-from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 
@@ -31,16 +30,14 @@ BASE = "the robot's base"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateRequest(RobotOptions):
-    """Calibrate the cameras of a recording; several `paths` only for logs of one session.
+class CalibrateRequest(SessionRequest, RobotOptions):
+    """Calibrate the cameras of a recording.
 
     out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera
     without a robot (None: the first). board: for initial poses. allow_unobserved: write an incomplete calibration.
     """
 
-    paths: tuple[Path, ...]
     out: Path | None = None
-    options: SourceOptions = field(default_factory=SourceOptions)
     urdf: Path | None = None
     hold: str | None = None
     board: Board | None = None

@@ -1,18 +1,27 @@
-"""A check: faults of a recording, before they cost an hour."""
+"""Faults of a recording, before they cost an hour; its conversion into a capture."""
 
+import json
 import statistics
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from importlib import metadata
 from pathlib import Path
 
+from splatctrl_cli import __version__
 from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity, error, note, warning
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import InputError, UsageError, refuse_if
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Result, Verdict, verdict_of
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.robot.logged_robot import TAKE, RobotOptions, differs, logged_urdf
-from splatctrl_cli.recording.source import open_logs
+from splatctrl_cli.jobs.running.device import advise_resumption, check_same_run
+from splatctrl_cli.jobs.running.progress import SILENT, Progress
+from splatctrl_cli.recording.calibrated import LOGGED
+from splatctrl_cli.recording.capture.capture_writer import JOURNAL, read_identity, write_capture
+from splatctrl_cli.recording.folder.folder_views import HOLDOUT
+from splatctrl_cli.recording.source import logged_descriptions, open_logs, open_session
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import own_spheres
@@ -26,15 +35,21 @@ _ALLOWING = {  # the options that take an error on
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckRequest(RobotOptions):
-    """One check of a recording; several `paths` only for logs of one session.
+class SessionRequest:
+    """A job on a recording; several `paths` only for logs of one session."""
+
+    paths: tuple[Path, ...]
+    options: SourceOptions = field(default_factory=SourceOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRequest(SessionRequest, RobotOptions):
+    """One check of a recording.
 
     num_images: of each topic, None for all. urdf: robot to compare with; with `spheres` alone the log's. fail_on:
     least severity that fails: "error", "warning" or "never".
     """
 
-    paths: tuple[Path, ...]
-    options: SourceOptions = field(default_factory=SourceOptions)
     num_images: int | None = None
     urdf: Path | None = None
     fail_on: str = "error"
@@ -104,8 +119,10 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
         if pair.holds:
             good.append(pair.median)
             continue
-        text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
-        text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
+        text = (
+            f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see); "
+            f"expected at most {1e3 * pair.limit:.0f} mm"
+        )
         remedy = f"{CAUSES}: calibrate the cameras' poses again (splatctrl calibrate), or widen the range of depth"
         value = round(1e3 * pair.median, 2)
         if len(both) > 1:
@@ -154,3 +171,70 @@ def _verdict(report: CheckReport, fail_on: str) -> Verdict:
         is_damaged=any(finding.code == "damaged" for finding in report.findings),
         counts={"messages": report.num_messages},
     )
+
+
+DECIDING_PACKAGES = ("numpy", "opencv-python-headless")  # whose versions may change a byte of a capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestRequest(SessionRequest):
+    """Write a recording as a capture; out: None for NAME.capture here, by the first path."""
+
+    out: Path | None = None
+    force: bool = False
+    resume: bool = False
+
+
+def ingest(request: IngestRequest, progress: Progress = SILENT) -> Result:
+    """Write the capture, or continue an interrupted one to the same bytes.
+
+    Raises UsageError without a camera or for another interrupted run, InputError for an unusable recording.
+    """
+    stopwatch, options = Stopwatch(), request.options
+    out = request.out or Path(request.paths[0].stem + ".capture")
+    with stopwatch.stage("survey"):
+        source = open_session(request.paths, options)
+        topics = source.joint_topics if isinstance(source, LOGGED) else None
+    refuse_if(
+        set(source.cameras) == {HOLDOUT},
+        f"--cameras {','.join(options.cameras or ())}: leaves no camera to train with",
+        remedy="name another, or leave it out",
+        error=UsageError,
+    )
+    robots = logged_descriptions(request.paths)
+    if len(robots) > 1:
+        places = ", ".join(where for _, where, _ in robots)
+        progress.log(
+            f"warning: {len(robots)} robots are described, by {places}: none is stored; give --urdf to each command"
+        )
+    progress.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
+    inputs = dict(source.digests())
+    versions = {"splatctrl": __version__, **{name: metadata.version(name) for name in DECIDING_PACKAGES}}
+    identity = json.loads(json.dumps({**versions, "options": asdict(options), "sha256": inputs}, default=str))
+    journal = partial_path(out) / JOURNAL
+    with (
+        advise_resumption(journal, journal.parent),
+        output_path(out, force=request.force, is_folder=True, checkpoint=JOURNAL, resume=request.resume) as partial,
+    ):
+        if (before := read_identity(partial)) is not None:
+            check_same_run(partial, before, identity)
+        with stopwatch.stage("write"):
+            metrics, num_resumed = write_capture(
+                partial,
+                source,
+                topics=topics,
+                robot=robots[0][2] if len(robots) == 1 else "",
+                progress=lambda num: progress.log(f"{num} frames") if num % 100 == 0 else None,
+                identity=identity,
+            )
+        if num_resumed:
+            progress.log(f"{num_resumed} frames were there already")
+        write_run(
+            partial,
+            command="ingest",
+            config=asdict(options),
+            inputs=inputs,
+            metrics=metrics,
+            stopwatch=stopwatch,
+        )
+    return Result(out=out, metrics=metrics, document={"capture": out, **metrics})

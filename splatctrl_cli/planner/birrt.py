@@ -138,8 +138,7 @@ class _Search:
             new = self.grown(
                 tree, self.random.uniform(model.lower, model.upper, (self.config.batch, len(model.lower)))
             )
-            meeting = self.met(tree, other, new) if len(new) else None
-            if meeting is not None:
+            if len(new) and (meeting := self.met(tree, other, new)) is not None:
                 return PlanOutcome.SOLVED, *self._join(*(meeting if tree is first else meeting[::-1]))
         return PlanOutcome.OUT_OF_ITERATIONS, np.empty((0, first.q.shape[1])), -1
 

@@ -1,126 +1,34 @@
-"""Scenes of solids, clearance of many postures and motions, and proofs of free edges.
+"""Clearance of many postures and motions in a scene, and proofs of free edges.
 
 B postures, J joints; R rows: moving spheres, then pairs of spheres.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
 from splatctrl_cli.errors import NotEvaluableError, refuse_if
-from splatctrl_cli.geometry import invert_transform, pose_at
 from splatctrl_cli.kernels.chain import EdgeRoom
-from splatctrl_cli.kernels.points import solid_distance
-from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE, CYLINDER
-from splatctrl_cli.records import Bool, DistanceField, Float64, Integers
+from splatctrl_cli.records import Bool, Float64, Integers
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
 
-STEP = 1e-6  # [m] of the differences that give a gradient
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ball:
-    """A ball at center (3,)."""
-
-    center: Float64
-    radius: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cuboid:
-    """A box of full size (3,) along its axes, placed by T_world_shape (4, 4)."""
-
-    size: Float64
-    T_world_shape: Float64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rod:
-    """A cylinder; `is_round`: a capsule, with caps of its radius on both ends."""
-
-    radius: float
-    length: float
-    T_world_shape: Float64
-    is_round: bool = False
-
-
-Solid = Ball | Cuboid | Rod
-
-
-@dataclass(frozen=True, kw_only=True)
-class Solids:
-    """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
-
-    Inside several: the depth in the deepest. Raises InputError for a size not above zero.
-    """
-
-    solids: Sequence[Solid]
-    _packed: Float64 = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        for index, solid in enumerate(self.solids):
-            refuse_if(not min(_sizes(solid)) > 0, f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
-        object.__setattr__(self, "_packed", np.array([_packed(solid) for solid in self.solids]).reshape(-1, 16))
-
-    def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Balls (., 4), boxes (., 15), rods (., 15) for `kernels.chain.EdgeRoom`."""
-        balls, boxes, cylinders, capsules = (
-            self._packed[self._packed[:, 0] == kind, 1:] for kind in (BALL, BOX, CYLINDER, CAPSULE)
-        )
-        # A capsule is a line padded by its radius, a cylinder has no padding.
-        rods = np.concatenate([cylinders, capsules[:, [*range(12), 14, 13, 12]]])
-        return np.column_stack([-balls[:, 9:12], balls[:, 12]]), boxes, rods
-
-    def distance(self, points: Float64) -> Float64:
-        """Signed distances (Q,) at points (Q, 3), inf without solids."""
-        return solid_distance(points, self._packed)
-
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Distance (Q,) and central-difference gradient (Q, 3)."""
-        steps = STEP * np.eye(3)
-        gradient = [(self.distance(points + step) - self.distance(points - step)) / (2 * STEP) for step in steps]
-        return self.distance(points), np.stack(gradient, axis=1)
-
-
-def _packed(solid: Solid) -> Float64:
-    if isinstance(solid, Ball):
-        kind, T, sizes = BALL, pose_at(solid.center), np.array([solid.radius, 0.0, 0.0])
-    elif isinstance(solid, Cuboid):
-        kind, T, sizes = BOX, solid.T_world_shape, solid.size / 2
-    else:
-        kind, T = CAPSULE if solid.is_round else CYLINDER, solid.T_world_shape
-        sizes = np.array([solid.radius, solid.length / 2, 0.0])
-    into = invert_transform(T)
-    return np.concatenate([[kind], into[:3, :3].ravel(), into[:3, 3], sizes])
-
-
-def _sizes(solid: Solid) -> tuple[float, ...]:
-    if isinstance(solid, Ball):
-        return (float(solid.radius),)
-    if isinstance(solid, Cuboid):
-        return tuple(float(v) for v in solid.size)
-    return float(solid.radius), float(solid.length)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnlyDistance:
-    """A field (splats, or baked) as a scene for planning."""
-
-    field: DistanceField
-
-    def distance(self, points: Float64) -> Float64:
-        return self.field.query(points)[0]
-
 
 class HasDistance(Protocol):
-    """A scene with distance but no gradient, such as `Solids`."""
+    """A scene with distance but no gradient."""
 
     def distance(self, points: Float64) -> Float64:
         """Signed distance (Q,) [m] at points (Q, 3) [m], world."""
+
+
+@runtime_checkable
+class SolidScene(HasDistance, Protocol):
+    """A scene of solids, among which a kernel proves edges."""
+
+    def rows(self) -> tuple[Float64, Float64, Float64]:
+        """Balls (., 4), boxes (., 15) and rods (., 15), as `EdgeRoom.among` takes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +37,7 @@ class Clearance:
 
     taken (R,) [m]: radii and margins; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a motion dq
     costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (else `lipschitz` scales its
-    rows). compiled: kernel for edges among `Solids`, None without a chain.
+    rows). compiled: kernel for edges in a `SolidScene`, None without a chain.
     """
 
     model: RobotModel
@@ -163,9 +71,8 @@ class Clearance:
         own = radii[pairs].sum(axis=1) + self_margin - model.self_allowance
         taken = np.concatenate([(radii + margin)[moving], own])
         rows = np.concatenate([lipschitz * levers[moving], _between(levers, pairs)])
-        chain, compiled = model.chain, None
-        if chain is not None:
-            compiled = EdgeRoom.of(chain, moving.astype(np.int64), pairs.astype(np.int64), taken, rows)
+        chain, which = model.chain, (moving.astype(np.int64), pairs.astype(np.int64))
+        compiled = None if chain is None else EdgeRoom.of(chain, *which, taken, rows)
         room = cls(
             model=model,
             scene=scene,
@@ -180,7 +87,7 @@ class Clearance:
 
     def replace_scene(self, scene: HasDistance) -> "Clearance":
         """Same arm and margins in another scene."""
-        if self.compiled is None or not isinstance(scene, Solids):
+        if self.compiled is None or not isinstance(scene, SolidScene):
             return replace(self, scene=scene)
         return replace(self, scene=scene, compiled=self.compiled.among(*scene.rows()))
 
@@ -271,7 +178,7 @@ def check_edges(
     Less than `contact` [m] counts as collision. Less than `give_up` [rad] before a collision stays unproved. With
     `only_whole`, a collision sets an edge's free_share to 0.
     """
-    if clearance.compiled is None or not isinstance(clearance.scene, Solids):
+    if clearance.compiled is None or not isinstance(clearance.scene, SolidScene):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)
     share, num_checks = clearance.compiled.advance(
         start,

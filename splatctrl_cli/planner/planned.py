@@ -63,9 +63,8 @@ def time_path(
     motion = np.abs(np.diff(waypoints, axis=0))
     is_long = np.max(motion, axis=1) > 0
     motion, is_new = motion[is_long], np.r_[True, is_long]
-    speed = np.min(velocity_limit / np.maximum(motion, 1e-12), axis=1)
-    if max_rate is not None:
-        speed = np.minimum(speed, max_rate[is_long])
+    fastest = np.inf if max_rate is None else max_rate[is_long]
+    speed = np.minimum(np.min(velocity_limit / np.maximum(motion, 1e-12), axis=1), fastest)
     acceleration = max_acceleration / np.max(motion, axis=1)
     speed = np.minimum(speed, np.sqrt(acceleration))  # a short edge is a triangle
     seconds = 1.0 / speed + speed / acceleration
@@ -78,6 +77,9 @@ def time_path(
 
 
 NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
+
+Ending = Callable[[Clearance, Float64], Float64]
+"""A goal posture (J,) in an arm's room -> free postures (W, J) that lead to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,12 +106,12 @@ def planned_path(
     planner: PlannerConfig,
     control: ControlConfig,
     *,
-    approach: float = 0.0,
+    ending: Ending | None = None,
 ) -> PlannedPath:
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
-    scene: lower bound of a 1-Lipschitz distance. Goal postures start from home, start and random guesses. approach
-    [m]: straight last stretch along the frame's z axis, as far as free.
+    scene: lower bound of a 1-Lipschitz distance. Goal postures start from home, start and random guesses. ending:
+    the path's last stretch.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -126,7 +128,7 @@ def planned_path(
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
         room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
-        outcome, way = _find(room, task, goals, approach, planner, control)
+        outcome, way = _find(room, task, goals, ending, planner)
         if outcome is PlanOutcome.SOLVED:
             path = time_path(
                 way,
@@ -151,15 +153,15 @@ def planned_path(
 
 
 def _find(
-    room: Clearance, task: ReplayTask, goals: Float64, approach: float, planner: PlannerConfig, control: ControlConfig
+    room: Clearance, task: ReplayTask, goals: Float64, ending: Ending | None, planner: PlannerConfig
 ) -> tuple[PlanOutcome, Float64]:
-    last = [approach_to(room, task.frame, goal, approach, planner, control) for goal in goals]
+    last = [goal[None] if ending is None else ending(room, goal) for goal in goals]
     before = np.array([way[0] for way in last])
     nearest_plan = path_to_nearest(room, np.clip(task.start, room.model.lower, room.model.upper), before, planner)
     if not nearest_plan.is_solved:
         return nearest_plan.outcome, nearest_plan.waypoints
-    ending = last[int(np.argmin(np.linalg.norm(before - nearest_plan.waypoints[-1], axis=1)))]
-    return nearest_plan.outcome, np.concatenate([nearest_plan.waypoints, ending[1:]])
+    stretch = last[int(np.argmin(np.linalg.norm(before - nearest_plan.waypoints[-1], axis=1)))]
+    return nearest_plan.outcome, np.concatenate([nearest_plan.waypoints, stretch[1:]])
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
@@ -168,28 +170,6 @@ def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: Pl
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
     nearest_plan = plan(room, start, nearest[:1], few, seed=planner.seed)
     return nearest_plan if nearest_plan.is_solved else plan(room, start, nearest, planner, seed=planner.seed)
-
-
-def approach_to(
-    room: Clearance, frame: str, goal: Float64, length: float, planner: PlannerConfig, control: ControlConfig
-) -> Float64:
-    """Postures (W, J) straight along the z axis of a goal's (J,) frame.
-
-    They start up to `length` [m] before it, as far as postures and edges are free.
-    """
-    model, way = room.model, [goal]
-    T_world_goal = model.frame_pose(goal, frame)
-    for back in np.arange(fixed.APPROACH_STEP, length + 1e-9, fixed.APPROACH_STEP):
-        T = T_world_goal.copy()
-        T[:3, 3] -= back * T[:3, 2]
-        q = _solve(model, frame, T, way[0], control)
-        if q is None or np.max(np.abs(q - way[0])) > fixed.APPROACH_TURN:
-            break
-        is_free = check_edges(room, q[None], way[0][None], contact=planner.contact).is_free[0]
-        if not is_free or room.at(q[None])[0] < planner.contact:
-            break
-        way.insert(0, q)
-    return np.array(way)
 
 
 def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:

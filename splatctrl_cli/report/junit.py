@@ -73,10 +73,9 @@ def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed"
 
     expected: outcome other than "passed" with which every case passes.
     """
-    by_criterion: dict[str, list[Mapping[str, Any]]] = {}
-    for reason in verdict["reasons"]:
-        by_criterion.setdefault(reason["criterion"], []).append(reason)
-    cases = [_case(name, group, reasons) for name, reasons in by_criterion.items()]
+    reasons = verdict["reasons"]
+    names = dict.fromkeys(reason["criterion"] for reason in reasons)
+    cases = [_case(name, group, [reason for reason in reasons if reason["criterion"] == name]) for name in names]
     damaged = [damage_case(group)] if verdict.get("is_damaged") else []
     if expected == "passed":
         return [*cases, *damaged]

@@ -125,8 +125,7 @@ def coarsen(is_unknown: NDArray[np.bool_], origin: Float64, voxel: float, most: 
         blocks = is_unknown[tuple(slice(0, n * factor) for n in shape)]
         cells = blocks.reshape(shape[0], factor, shape[1], factor, shape[2], factor)
         full = 2 * cells.sum(axis=(1, 3, 5), dtype=np.int32) >= factor**3
-        borders = np.argwhere(full & ~binary_erosion(full, border_value=1))
-        if len(borders) <= most:
+        if len(borders := np.argwhere(full & ~binary_erosion(full, border_value=1))) <= most:
             return np.asarray(origin + voxel * (factor * borders + (factor - 1) / 2), np.float32), factor * voxel
         factor += 1
 

@@ -143,9 +143,8 @@ def commands_picture(
             len(joints) + 1, 1, sharex=True, height_ratios=[0.78] * len(joints) + [_strip_height(interventions)]
         )
         for j, (axes, joint) in enumerate(zip(rows, joints, strict=True)):
-            beneath = 0.0
-            if logged is not None:
-                beneath = _curve(axes, seconds, column(logged, j), color=QUIET, width=2.6)
+            under = None if logged is None else column(logged, j)
+            beneath = 0.0 if under is None else _curve(axes, seconds, under, color=QUIET, width=2.6)
             peak = _curve(axes, seconds, column(velocity, j), color=CURVE_COLORS[0], width=1.5)
             _limit_axis(axes, joint, float(limits[j]), peak, beneath)
             _tidy(axes, seconds)

@@ -3,20 +3,20 @@
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, SphereSet, UInt8, merge_by_stamp
+from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, SphereSet, merge_by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import visual_urdf
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.arm import UNMODELLED, Capsule, Motion, link_shape
-from splatctrl_cli.simulate.depth_camera import WIDTH, DepthNoise, StereoDepth
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import WIDTH, Camera, DepthNoise, Renderer, StereoDepth
 from splatctrl_cli.simulate.truth import distance_to
 
 START_NS = 1_700_000_000_000_000_000
@@ -162,7 +162,10 @@ class Recording:
             if cameras is not None and renderer.camera.name not in cameras:
                 continue
             color, depth = renderer.image([*arm, *passing], meshes)
-            human = _mark_shown(depth, renderer.depth(arm, meshes)) if self._has_people else None
+            human = None
+            if self._has_people:
+                without = renderer.depth(arm, meshes)
+                human = np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)
             if noise is not None:
                 rng, focal = np.random.default_rng([self.options.seed, number, index]), renderer.camera.intrinsics.fx
                 depth = noise.applied(depth, rng, focal=focal)
@@ -186,11 +189,14 @@ class Recording:
 
     def static_transforms(self) -> list[Transform]:
         """Frames world -> camN_link -> camN_optical_frame, and world -> the arm's root link."""
-        transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
-        for camera in self.cameras:
-            transforms.append(("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T))
-            transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
-        return transforms
+        of_cameras = (
+            (
+                ("world", f"{camera.name}_link", camera.T_world_camera @ OPTICAL_FROM_LINK.T),
+                (f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK),
+            )
+            for camera in self.cameras
+        )
+        return [("world", self.robot.urdf.links[0], self.robot.T_world_base), *chain.from_iterable(of_cameras)]
 
     def link_transforms(self, q: Float64) -> list[Transform]:
         """Parent link -> link, except the root, at q (J,)."""
@@ -235,7 +241,3 @@ def _add_parts(robot: RobotModel, parts: Sequence[tuple[str, Capsule]]) -> Robot
         radii=np.append(own.radii, radii),
     )
     return RobotModel.from_urdf(robot.urdf.path, spheres, T_world_base=robot.T_world_base)
-
-
-def _mark_shown(depth: Float32, without: Float32) -> UInt8:
-    return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

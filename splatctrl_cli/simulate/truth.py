@@ -167,20 +167,13 @@ def _primitive_document(primitive: Primitive) -> dict[str, Any]:
     }
 
 
-def _track(entry: dict[str, Any] | None) -> Track | None:
-    if entry is None:
-        return None
-    poses = np.array([_pose(rows) for rows in entry["T_world_shape"]])
-    return Track(stamp_ns=np.array(entry["stamp_ns"], dtype=np.int64), T_world_shape=poses)
-
-
 def _primitive(entry: dict[str, Any]) -> Primitive:
     refuse_if(
         len(entry["size"]) != NUM_SIZES[entry["kind"]] or min(entry["size"]) <= 0,
         f"size of {entry['name']}: {entry['size']}",
         error=ValueError,
     )
-    texture = entry["texture"]
+    texture, track = entry["texture"], entry.get("track")
     return Primitive(
         name=entry["name"],
         kind=entry["kind"],
@@ -189,7 +182,12 @@ def _primitive(entry: dict[str, Any]) -> Primitive:
         texture=Texture(**{**texture, "dark": tuple(texture["dark"]), "bright": tuple(texture["bright"])}),
         from_ns=ALWAYS[0] if entry["from_ns"] is None else entry["from_ns"],
         to_ns=ALWAYS[1] if entry["to_ns"] is None else entry["to_ns"],
-        track=_track(entry.get("track")),
+        track=None
+        if track is None
+        else Track(
+            stamp_ns=np.array(track["stamp_ns"], dtype=np.int64),
+            T_world_shape=np.array([_pose(rows) for rows in track["T_world_shape"]]),
+        ),
     )
 
 

@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import AuditTrace, DistanceFunction, audit, observed_at
-from splatctrl_cli.control.columns import audit_columns, step_columns
-from splatctrl_cli.control.events import (
+from splatctrl_cli.control.columns import (
     UNREPRESENTED,
     Event,
     EventKind,
     Obstacle,
     Signal,
+    audit_columns,
     audit_signals,
     events_of,
     first_intervention,
     motion_signals,
+    step_columns,
     step_signals,
 )
 from splatctrl_cli.control.qp import Rung

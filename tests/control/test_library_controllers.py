@@ -33,7 +33,7 @@ def controller_input(arm: RobotModel, q: Float64, dq: Float64, goal: Float64) ->
         pose=arm.frame_pose(q, FRAME),
         error=np.zeros(6),
         jacobian=arm.frame_jacobian(q, FRAME),
-        ask_rows=lambda: (),
+        rows=lambda: (),
     )
 
 

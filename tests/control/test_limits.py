@@ -11,8 +11,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig, load_config
 from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.control.limits import FR3_JOINTS, JointLimits, MotionLimits, braking_speed, fr3_limits
 from splatctrl_cli.control.replay import OpenLoopTask, ReplayTask, closed_loop, open_loop
+from splatctrl_cli.control.terms import FR3_JOINTS, JointLimits, MotionLimits, braking_speed, fr3_limits
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64, Index, Stamps
 from tests.control.fakes import PlanarArm, far_away

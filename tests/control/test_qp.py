@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import can_bind
 from splatctrl_cli.control.goals import pose_error, reference_velocity, rotation_vector
-from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.qp import (
     SOLVERS,
     QuadraticProgram,
@@ -31,6 +30,7 @@ from splatctrl_cli.control.terms import (
     eliminated_weight,
     reach_cost,
     stray_cost,
+    velocity_box,
 )
 from splatctrl_cli.geometry import rotation_from_quat, transform_from
 from splatctrl_cli.records import Float64

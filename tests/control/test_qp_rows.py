@@ -11,11 +11,10 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import BRAKING_SHARE
 from splatctrl_cli.control.barriers import SceneStep, distance_rate, scene_margin
-from splatctrl_cli.control.limits import JointLimits, box_rows
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows, assemble_printed
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.control.terms import RowKind, State, stray_cost
+from splatctrl_cli.control.terms import JointLimits, RowKind, State, box_rows, stray_cost
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away, sample_arm

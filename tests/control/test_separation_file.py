@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.separation import Deceleration, StopTable
-from splatctrl_cli.control.separation_file import DeclaredSeparation, read_separation
+from splatctrl_cli.control.separation import Deceleration, DeclaredSeparation, StopTable, read_separation
 from splatctrl_cli.errors import InputError, UsageError
 from tests.refused import expect_refusal
 

@@ -15,8 +15,7 @@ from splatctrl_cli.checks import check_log
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
-from splatctrl_cli.jobs.check import pose_robot
-from splatctrl_cli.jobs.ingest import IngestRequest, ingest
+from splatctrl_cli.jobs.check import IngestRequest, ingest, pose_robot
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.source import open_source

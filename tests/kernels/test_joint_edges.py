@@ -8,19 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.config.fixed import STILL_ROW
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.planner.configuration_clearance import (
-    ROUNDING,
-    Ball,
-    Clearance,
-    Cuboid,
-    Rod,
-    Solid,
-    Solids,
-    check_edges,
-    check_sampled_edges,
-)
+from splatctrl_cli.planner.configuration_clearance import ROUNDING, Clearance, check_edges, check_sampled_edges
 from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel

@@ -6,11 +6,12 @@ import pytest
 from numpy.typing import ArrayLike
 
 from experiments.paths import joint_length
+from experiments.solids import OnlyDistance, Solids
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner import birrt
 from splatctrl_cli.planner.birrt import PlanOutcome, plan, shorten_path
-from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, OnlyDistance, Solids, check_edges
+from splatctrl_cli.planner.configuration_clearance import Clearance, EdgeCheck, check_edges
 from splatctrl_cli.planner.planned import resample
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, Nowhere, PlanarArm, Plane

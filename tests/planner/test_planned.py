@@ -1,25 +1,26 @@
 """A replay's task planned: postures at a goal pose, margins that start and goal allow, proved edges, times."""
 
 from dataclasses import replace
+from functools import partial
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from experiments.paths import joint_length, least_clearance
+from experiments.paths import approach_to, joint_length, least_clearance
 from experiments.problems import simulated_arm
+from experiments.solids import Ball, Solids
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.planner.birrt import plan
-from splatctrl_cli.planner.configuration_clearance import Ball, Clearance, Solids
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,
     NO_POSTURE,
     START_BLOCKED,
     PlannedPath,
-    approach_to,
     effector_rates,
     goal_postures,
     path_to_nearest,
@@ -90,9 +91,10 @@ def test_a_hand_comes_straight_to_its_goal_as_far_as_that_is_free() -> None:
     start, goal = np.array([[0.8, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785], [-0.8, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]])
     pose = model.frame_pose(goal, "hand")
     asked = ReplayTask(start=start, T_world_goal=pose, frame="hand", home=goal)
+    ending = partial(approach_to, frame="hand", length=0.12, planner=PLANNER, control=CONFIG)
 
     def before(scene: Solids) -> list[float]:
-        path = planned_path(model, scene, asked, PLANNER, CONFIG, approach=0.12).path
+        path = planned_path(model, scene, asked, PLANNER, CONFIG, ending=ending).path
         T_goal = np.linalg.inv(pose) @ [model.frame_pose(q, "hand") for q in path.waypoints]
         np.testing.assert_allclose(T_goal[-1], np.eye(4), atol=2e-3)
         is_on_axis = np.linalg.norm(T_goal[:, :2, 3], axis=1) < 1e-3
@@ -100,7 +102,7 @@ def test_a_hand_comes_straight_to_its_goal_as_far_as_that_is_free() -> None:
         return np.round(T_goal[is_on_axis & ~is_turned, 2, 3], 2).tolist()
 
     assert before(ball(3.0, 3.0)) == pytest.approx([-0.12, -0.08, -0.04, 0.0])
-    whole = approach_to(Clearance.of(model, ball(3.0, 3.0)), "hand", goal, 0.12, PLANNER, CONFIG)
+    whole = ending(Clearance.of(model, ball(3.0, 3.0)), goal)
     centers, radii = model.sphere_centers_batch(whole), model.sphere_set.radii
     away = (np.linalg.norm(centers[0][:, None, None] - centers[None, 2:], axis=3) - radii).min(axis=(1, 2))
     assert away.max() > CONFIG.margin + 0.01

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from splatctrl_cli.planner.configuration_clearance import Ball, Clearance, Cuboid, Solids
+from experiments.solids import Ball, Cuboid, Solids
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from tests.control.fakes import PlanarArm
 
 

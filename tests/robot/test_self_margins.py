@@ -9,13 +9,14 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from experiments.solids import Solids
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.geometry import pose_at, transform_points
-from splatctrl_cli.planner.configuration_clearance import Clearance, Solids
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import MeshDistance, Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from splatctrl_cli.records import Float32, Float64
-from splatctrl_cli.simulate.depth_camera import BASELINE, FOCAL, STEPS, DepthNoise, StereoDepth
+from splatctrl_cli.simulate.render import BASELINE, FOCAL, STEPS, DepthNoise, StereoDepth
 
 QUIET = StereoDepth(spread=0.0, dropout=0.0)
 

@@ -10,8 +10,8 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
 from splatctrl_cli.simulate.arm import UNMODELLED, Block, Capsule, link_shape
-from splatctrl_cli.simulate.depth_camera import StereoDepth
 from splatctrl_cli.simulate.primitives import Primitive, signed_distance
+from splatctrl_cli.simulate.render import StereoDepth
 from splatctrl_cli.simulate.tabletop import arm_solids
 from tests.tools.test_hunt import START, ball, in_view, read, shown_of, world_of
 from tools.hunt.body import Body, draw_body

@@ -13,8 +13,8 @@ mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip inst
 from splatctrl_cli.records import Float64, Intrinsics, SphereSet  # noqa: E402
 from splatctrl_cli.robot.model import RobotModel  # noqa: E402
 from splatctrl_cli.simulate import render, tabletop  # noqa: E402
-from splatctrl_cli.simulate.depth_camera import StereoDepth  # noqa: E402
 from splatctrl_cli.simulate.primitives import Primitive  # noqa: E402
+from splatctrl_cli.simulate.render import StereoDepth  # noqa: E402
 from splatctrl_cli.simulate.truth import distance_to  # noqa: E402
 from tests.tools.test_mujoco import LENS, renderer  # noqa: E402, F401
 from tools.mujoco.cell import Cell, as_piece  # noqa: E402

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.simulate.arm import SHAPES, SLIM, UNMODELLED, Block, Capsule
-from splatctrl_cli.simulate.depth_camera import StereoDepth
+from splatctrl_cli.simulate.render import StereoDepth
 
 FIRST_OF_STEREO = 200  # the first seed whose runs have visual shapes and stereo depth
 PLAIN_SHARE = 0.10  # of its runs, in which the arm looks as it collides and depth is nearly exact, as in seeds before

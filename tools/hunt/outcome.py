@@ -6,7 +6,7 @@ from pathlib import Path
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
 from splatctrl_cli.jobs.replay.evidence_criteria import LIMITS
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import Trace
 
 WORDS = ("safe", "waived", "failed", "contact", "not evaluable", "refused")
 LONGEST = 90  # characters of a reason

@@ -12,10 +12,9 @@ from splatctrl_cli.recording.container.mcap_writer import mcap_log
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Block, Capsule, link_shape
-from splatctrl_cli.simulate.depth_camera import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.recording import JOINT_RATE, OPTICAL_FROM_LINK, START_NS
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.tabletop import PALETTE
 from tools.hunt.faults import Fault
 from tools.hunt.world import DURATION_S, FPS, NS, NUM_FRAMES, World, at_s

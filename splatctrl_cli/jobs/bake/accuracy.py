@@ -24,7 +24,7 @@ from splatctrl_cli.field.distance import KERNEL_OF, probabilities
 from splatctrl_cli.field.grid_cells import LOSS, exact_channel
 from splatctrl_cli.jobs.bake.request import BakeRequest, BakeSource
 from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.records import DistanceGrid, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.report.field_pictures import Reliability
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
@@ -76,10 +76,16 @@ def _compare_with_truth(
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     chunks = np.array_split(points, -(-len(points) // 50_000))  # else large (points x primitives) arrays
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)
+    channels: dict[str, NDArray[np.generic]] = {
+        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
+        for name in ("sdf", "hard", "bound")
+        if name in grid.channels
+    }
+    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
     forms = probabilities(spheres, request.config.field, threads=request.threads)
     return compare_with_truth(
         points,
-        _fields(grid, drawn),
+        {"hard": exact.astype(np.float64), "sdf": channels["sdf"].astype(np.float64)},
         np.concatenate(distances),
         np.concatenate(surfaces),
         _frames(request.seen_by, source.cameras, stamp_ns),
@@ -88,17 +94,6 @@ def _compare_with_truth(
         median_radius=median_radius(grid),
         probabilities={name: form.at for name, form in forms.items()},
     )
-
-
-def _fields(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """Values of hard and sdf at drawn cells."""
-    channels: dict[str, NDArray[np.generic]] = {
-        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32)
-        for name in ("sdf", "hard", "bound")
-        if name in grid.channels
-    }
-    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
-    return {"hard": exact.astype(np.float64), "sdf": channels["sdf"].astype(np.float64)}
 
 
 def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator[RgbdFrame]:
@@ -127,12 +122,15 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
     )
     urdf, names = request.urdf, recording.joint_names
     robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
-    counted = []
-    for frame, at in newest.values():
-        spheres = None
-        if robot is not None and at is not None:
-            spheres = robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii
-        counted.append(counted_pixels(frame, source.workspace, spheres))
+    spheres = [
+        None
+        if robot is None or at is None
+        else (robot.sphere_centers(robot.positions_of(names, at.position)), robot.sphere_set.radii)
+        for _, at in newest.values()
+    ]
+    counted = [
+        counted_pixels(frame, source.workspace, its) for (frame, _), its in zip(newest.values(), spheres, strict=True)
+    ]
     return compare_with_held_out_depth(
         grid, [frame for frame, _ in newest.values()], seed=request.seed, counted=counted
     )
@@ -221,34 +219,33 @@ def bake_verdict(
     """Judge the channels' loss of distance [m], unobserved boxes, and each ``--require``."""
     statistics, voxel = document["statistics"], document["voxel"]
     num_cells, loss = statistics["num_cells"], LOSS * voxel
-    reasons = [
-        Reason(
-            criterion="loss",
-            outcome=Outcome.PASSED,
-            sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
-            value=loss,
-            threshold=request.config.field.max_loss,
-            unit="m",
-            count=num_cells,
-        )
-    ]
-    if has_occupancy and statistics["never_seen_share"] == 1:
-        reasons.append(
-            Reason(
-                criterion="known space",
-                outcome=Outcome.NOT_EVALUABLE,
-                sentence="no cell of the grid was ever seen by a camera",
-                value=1.0,
-                threshold=1.0,
-                remedy="give a --box that the cameras saw",
-                count=num_cells,
-            )
-        )
-    reasons += [note(criterion="field", sentence=text) for text in document["warnings"]]
+    of_loss = Reason(
+        criterion="loss",
+        outcome=Outcome.PASSED,
+        sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
+        value=loss,
+        threshold=request.config.field.max_loss,
+        unit="m",
+        count=num_cells,
+    )
+    never_seen = Reason(
+        criterion="known space",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence="no cell of the grid was ever seen by a camera",
+        value=1.0,
+        threshold=1.0,
+        remedy="give a --box that the cameras saw",
+        count=num_cells,
+    )
     counts = counts_of(metrics)
     return verdict_of(
         "sdf-bake",
-        [*reasons, *gate_reasons(request.require, metrics, counts)],
+        [
+            of_loss,
+            *([never_seen] if has_occupancy and statistics["never_seen_share"] == 1 else []),
+            *(note(criterion="field", sentence=text) for text in document["warnings"]),
+            *gate_reasons(request.require, metrics, counts),
+        ],
         scope=f"{' x '.join(map(str, document['shape']))} cells of {voxel:g} m, {metrics['num_splats']} splats",
         counts=counts,
     )

@@ -49,9 +49,14 @@ from splatctrl_cli.jobs.bake.request import (
     read_bake_source,
     read_previous,
 )
-from splatctrl_cli.jobs.running.device import Device, explain_faults
+from splatctrl_cli.jobs.running.device import (
+    Device,
+    advise_resumption,
+    check_resumption,
+    deciding_versions,
+    explain_faults,
+)
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, deciding_versions
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.report.field_pictures import (
     Reliability,

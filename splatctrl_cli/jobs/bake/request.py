@@ -56,7 +56,6 @@ class BakeRequest(RunOptions):
     previous_scene: Path | None = None
     resume: bool = False
     require: tuple[str, ...] = ()
-    seed: int = 0
 
     @property
     def label_names(self) -> list[str]:
@@ -224,9 +223,8 @@ def choose_box(request: BakeRequest, source: BakeSource, previous: Previous | No
         return request.box
     if request.urdf is not None:
         return RobotModel.from_urdf(request.urdf, request.spheres).reach_box
-    if previous is not None:
-        return previous.box
-    return bounding_box(field_splats(source.splats, request.labels), request.config.field.padding)
+    padding = request.config.field.padding
+    return bounding_box(field_splats(source.splats, request.labels), padding) if previous is None else previous.box
 
 
 def device_for(request: BakeRequest, layout: GridLayout, num_splats: int, progress: Progress) -> Device:

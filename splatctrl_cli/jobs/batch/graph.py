@@ -44,11 +44,9 @@ class CommandLine(Protocol):
 
         Raises UsageError for an unknown option.
         """
-        ...
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
         """Options in a command's words, as `parsed` takes them, without those a batch gives."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,12 +277,9 @@ def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
 def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
     """Fill each {place}; a text that is one place may become a list."""
     if isinstance(value, str):
-        alone = _PLACE.fullmatch(value)
-        return filled(alone[1]) if alone else _PLACE.sub(lambda match: _one(filled(match[1])), value)
+        if alone := _PLACE.fullmatch(value):
+            return filled(alone[1])
+        return _PLACE.sub(lambda match: one[0] if isinstance(one := filled(match[1]), list) else str(one), value)
     if isinstance(value, Mapping):
         return {key: _fill_places(each, filled) for key, each in value.items()}
     return [_fill_places(each, filled) for each in value] if isinstance(value, list) else value
-
-
-def _one(value: Any) -> str:
-    return value[0] if isinstance(value, list) else str(value)

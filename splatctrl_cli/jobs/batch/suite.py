@@ -238,8 +238,7 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> N
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
     for key in table:
-        if key not in known:
-            raise UsageError(f"{where}: unknown key {key!r}", remedy=_suggest(key, known))
+        refuse_if(key not in known, f"{where}: unknown key {key!r}", remedy=_suggest(key, known), error=UsageError)
 
 
 def _suggest(word: str, known: Sequence[str], otherwise: str = "known here") -> str:

@@ -98,9 +98,8 @@ def read_judged(path: Path) -> JudgedRuns:
     what = "no run.json and no batch.json in it" if path.is_dir() else "no such folder"
     refuse_if(not has_run, f"{path}: expected the output folder of a command or a batch, got {what}")
     run = open_run(path)
-    parts = {run.command: run}
-    if run.command == AUDIT:
-        parts = {file.parent.name: open_run(file.parent) for file in sorted(path.glob("*/run.json"))}
+    files = sorted(path.glob("*/run.json")) if run.command == AUDIT else []
+    parts = {file.parent.name: open_run(file.parent) for file in files} or {run.command: run}
     judging = {job: part for job, part in parts.items() if part.verdict and part.command in (*scales(), "demo")}
     refuse_if(
         not judging,

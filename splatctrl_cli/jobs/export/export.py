@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError, refuse_if, require
 from splatctrl_cli.evaluate.verdict import Result
 from splatctrl_cli.files.output import finite, output_path, sha256
@@ -307,8 +307,7 @@ def _parts(run: RunFolder, roots: tuple[Path, ...]) -> Iterator[Later]:
 
 def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> Iterator[Later]:
     start = int(states.stamps_ns[0])
-    grid = run.option("--field")
-    if grid is None:
+    if (grid := run.option("--field")) is None:
         known = sets_known(run, states, scene_of(run, roots))
         yield from _space_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TextIO
@@ -87,16 +88,16 @@ def scene_answers(
         field = OnDevice(spheres, config.field, device, threads=threads)
     probability = PROBABILITIES[config.field.probability](spheres, config.field, threads)
     reach = float(np.abs(splats.centers - spheres.anchor).max())
-    states = None if known is None else known.states(limits.free_below, limits.occupied_above)
+    states_at = None
+    if known is not None:
+        states = known.states(limits.free_below, limits.occupied_above)
+        states_at = partial(observed_at, states, known.origin, known.voxel)
 
     def at(points: Float64, of_grid: Answers | None = None) -> Answers:
         distance, gradient = field.query(points)
         nearest = exact.nearest(points)
         surface, rest, _ = march(field, exact, points, steps=MARCH_STEPS)
         size = reach + np.abs(points - spheres.anchor).max(axis=1)
-        observed = None
-        if known is not None and states is not None:
-            observed = observed_at(states, known.origin, known.voxel, points).astype(np.int8)
         answers = Answers(
             in_box=None if source.workspace is None else source.workspace.contains(points),
             distance=distance,
@@ -106,7 +107,7 @@ def scene_answers(
             probability=probability.at(points, distance),
             label=splats.labels[nearest].astype(np.int8),
             splat=obstacles.index[nearest],
-            observed=observed,
+            observed=None if states_at is None else states_at(points).astype(np.int8),
             surface=surface,
             rest=rest,
         )
@@ -293,15 +294,13 @@ def _is_enough(points: Path | TextIO) -> bool:
 
 def _grid_file(source: Path) -> Path | None:
     """``field.npz`` of a field, None for a scene."""
-    if source.is_file() and source.suffix == ".npz":
-        return source
-    file = source / "field.npz"
-    if file.is_file():
-        return file
+    file = source if source.suffix == ".npz" and source.is_file() else source / "field.npz"
     refuse_if(
-        (source / "field.json").is_file(), f"{source}: a field without field.npz", remedy="bake it with --formats npz"
+        not file.is_file() and (source / "field.json").is_file(),
+        f"{source}: a field without field.npz",
+        remedy="bake it with --formats npz",
     )
-    return None
+    return file if file.is_file() else None
 
 
 def _scene(

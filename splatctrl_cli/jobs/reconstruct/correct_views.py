@@ -74,8 +74,7 @@ class Corrections:
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
                 for row, f in zip(rows, moved, strict=True)
             ]
-        gains = _gains(moved, scale, console, is_requested=self.exposure)
-        if gains is not None:
+        if (gains := _gains(moved, scale, console, is_requested=self.exposure)) is not None:
             report["exposure_spread"] = float(np.abs(np.log(gains)).max())
             rows = [row | {"gain": gain.tolist()} for row, gain in zip(rows, gains, strict=True)]
             moved = [exposed(frame, gain) for frame, gain in zip(moved, gains, strict=True)]
@@ -92,16 +91,13 @@ def _correct_poses(
         frames = freed(recorded, bends.grids)
         found = refined_poses(frames, scale)
     before, after, median = (1e3 * value for value in (recorded_apart, found.after, float(np.median(found.moved))))
-    if found.is_better:
-        console.log(
-            f"poses: {len(frames)} views moved by {median:.1f} mm in the median, at most"
-            f" {1e3 * found.moved.max():.1f} mm and {found.turned.max():.2f} deg: surfaces of two views are"
-            f" {after:.2f} mm apart instead of {before:.2f}"
-        )
-    else:
-        console.log(
-            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no correction reduces it"
-        )
+    console.log(
+        f"poses: {len(frames)} views moved by {median:.1f} mm in the median, at most"
+        f" {1e3 * found.moved.max():.1f} mm and {found.turned.max():.2f} deg: surfaces of two views are"
+        f" {after:.2f} mm apart instead of {before:.2f}"
+        if found.is_better
+        else f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no correction reduces it"
+    )
     return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
         "pose_residual": found.after,
         "poses": {

@@ -58,9 +58,8 @@ def _num_new(spheres: SplatSet, field: SphereField | None, grid: OccupancyGrid) 
     is_inside = np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=1)
     is_free = np.zeros(len(cells), bool)
     is_free[is_inside] = grid.log_odds[tuple(cells[is_inside].T)] < 0.0
-    if field is None:
-        return int(is_free.sum())
-    return int(np.count_nonzero(field.query(centers[is_free])[0] + spheres.radii[is_free] > 0.5 * grid.voxel))
+    away = np.full(int(is_free.sum()), np.inf) if field is None else field.query(centers[is_free])[0]
+    return int(np.count_nonzero(away + spheres.radii[is_free] > 0.5 * grid.voxel))
 
 
 def _spheres(splats: SplatSet, balls: Balls | None) -> SplatSet | None:

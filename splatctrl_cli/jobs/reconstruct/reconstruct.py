@@ -22,9 +22,15 @@ from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, Recons
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
 from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
-from splatctrl_cli.jobs.running.device import FitDevice, explain_faults
+from splatctrl_cli.jobs.running.device import (
+    FitDevice,
+    advise_resumption,
+    check_resumption,
+    checkpoint_to_go_on_from,
+    explain_faults,
+    identity,
+)
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
-from splatctrl_cli.jobs.running.resume import advise_resumption, check_resumption, checkpoint_to_go_on_from, identity
 from splatctrl_cli.recording.calibrated import LOGGED
 from splatctrl_cli.recording.log.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.recording.source import open_source
@@ -108,10 +114,9 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Jud
 
 
 def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
+    off = {"learn": False} if request.self_model == NO_SELF_MODEL else {}
     files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
-    is_off = request.self_model == NO_SELF_MODEL
-    files["self-model"] = None if is_off else request.self_model
-    off = {"learn": False} if is_off else {}
+    files |= {"self-model": None if off else request.self_model}
     return identity({"seed": request.seed, **request.options, **off}, files, request.config, inputs)
 
 

@@ -70,7 +70,6 @@ class ReconstructRequest(RunOptions):
     allow_disagreement: bool = False
     corrections: Corrections = field(default_factory=Corrections)
     resume: bool = False
-    seed: int = 0
     device: str = CPU
     require: Sequence[str] = ()
     options: Mapping[str, object] = field(default_factory=dict)
@@ -395,9 +394,8 @@ class Reconstruction:
             return self.request.box
         if self.robot is not None:
             return self.robot.reach_box
-        if self.cloud is not None:
-            return cloud_box(self.cloud)
-        return depth_box(first.frames, self.config.occupancy.max_range, self.config.scene.scale or 1.0)
+        limit, scale = self.config.occupancy.max_range, self.config.scene.scale or 1.0
+        return depth_box(first.frames, limit, scale) if self.cloud is None else cloud_box(self.cloud)
 
     def _posture(self, step: TimeStep) -> RobotPosture | None:
         if self.robot is None or step.position is None:
@@ -415,8 +413,7 @@ class Reconstruction:
     def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:
         if posture is None or not self.declared.carried or self.robot is None:
             return
-        seconds = self._seconds(step.stamp_ns)
-        if self.declared.carried_at(seconds):
+        if self.declared.carried_at(seconds := self._seconds(step.stamp_ns)):
             for frame in step.frames:
                 mask = self_mask(frame, posture, self.config.occupancy)
                 count_carried(self.declared, frame, mask, posture, self.robot.surface_at(step.stamp_ns), seconds)

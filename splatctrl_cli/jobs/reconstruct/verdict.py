@@ -161,12 +161,10 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 
 
 def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
-    sentence = f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it"
-    if is_corrected(row):
-        sentence += f"; its pose is corrected to within {row['left_mm']:.1f} mm"
+    left = f"; its pose is corrected to within {row['left_mm']:.1f} mm" if is_corrected(row) else ""
     return note(
         criterion="calibration",
-        sentence=sentence,
+        sentence=f"{camera} sees the robot {row['distance_mm']:.1f} mm from where its joints put it{left}",
         value=row["distance_mm"],
         threshold=1e3 * fixed.MISPLACED,
         unit="mm",

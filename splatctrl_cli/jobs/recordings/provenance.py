@@ -54,11 +54,11 @@ def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]
             nearest[record.camera] = record
         if record.stamp_ns >= last and len(nearest) == len(wanted):
             break
-    lines = []
-    for camera, first in wanted.items():
-        found = nearest.get(camera)
-        lines += [f"has no camera {camera}"] if found is None else _differences(first, found)
-    return lines
+    return [
+        line
+        for camera, first in wanted.items()
+        for line in (_differences(first, nearest[camera]) if camera in nearest else [f"has no camera {camera}"])
+    ]
 
 
 def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -188,8 +188,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
     for link, (*corners, area) in theirs.items():
         if link not in ours:
             return f"with link {link}, which this one does not have"
-        off = np.abs(np.subtract(corners, ours[link][:-1])).max()
-        if off > fixed.SAME_LINK:
+        if (off := np.abs(np.subtract(corners, ours[link][:-1])).max()) > fixed.SAME_LINK:
             return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
         if abs(area / ours[link][-1] - 1) > fixed.SAME_LINK_AREA:
             return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
-from splatctrl_cli.control.columns import names_at
-from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.columns import Event, EventKind, names_at
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.records import Float64
 from splatctrl_cli.voxels import EvidenceClass
 

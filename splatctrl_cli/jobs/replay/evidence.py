@@ -17,9 +17,8 @@ from splatctrl_cli.calibration.displacement import correct_pose
 from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.sections import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.columns import names_at
-from splatctrl_cli.control.events import Event, EventKind, Obstacle, clearance_signals, events_of
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.control.columns import Event, EventKind, Obstacle, clearance_signals, events_of, names_at
+from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.evaluate.metrics import clearance_agreement, mark_seen
@@ -29,8 +28,7 @@ from splatctrl_cli.files.spilled_rows import Rows, ranges
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruct.reconstruction import training_cameras
-from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.recording.state.state_source import open_states
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
@@ -70,11 +68,12 @@ def every_of(evidence: str | None) -> int | None:
         every = int(evidence or "")
     except ValueError:
         return None
-    if every < 2:
-        raise UsageError(
-            f"--evidence {evidence}: expected a camera, or a number of frame sets from 2",
-            remedy="--evidence 4 leaves every 4th frame set out of the training",
-        )
+    refuse_if(
+        every < 2,
+        f"--evidence {evidence}: expected a camera, or a number of frame sets from 2",
+        remedy="--evidence 4 leaves every 4th frame set out of the training",
+        error=UsageError,
+    )
     return every
 
 
@@ -83,24 +82,34 @@ def check_evidence(request: ReplayRequest) -> None:
     if request.evidence is None:
         return
     every, option = every_of(request.evidence), f"--evidence {request.evidence}"
-    if request.field is not None:
-        raise UsageError(f"{option}: a baked field does not say which cameras made it", remedy="give --scene")
+    refuse_if(
+        request.field is not None,
+        f"{option}: a baked field does not say which cameras made it",
+        remedy="give --scene",
+        error=UsageError,
+    )
     if request.lockstep:
-        if every is None and request.evidence in (request.options.cameras or ()):
-            raise UsageError(f"{option}: --cameras names it as a training camera", remedy="leave it out of --cameras")
+        refuse_if(
+            every is None and request.evidence in (request.options.cameras or ()),
+            f"{option}: --cameras names it as a training camera",
+            remedy="leave it out of --cameras",
+            error=UsageError,
+        )
         return
     assert request.scene is not None
     scene = open_scene(request.scene)
-    if every is None and request.evidence in scene.cameras:
-        raise UsageError(
-            f"{option}: the camera trained {request.scene}",
-            remedy=f"name one that did not: any but {', '.join(scene.cameras)}",
-        )
-    if every is not None and scene.run.get("metrics", {}).get(EVERY) != every:
-        raise UsageError(
-            f"{option}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
-            remedy="name a camera that did not, or give --lockstep, which leaves these sets out",
-        )
+    refuse_if(
+        every is None and request.evidence in scene.cameras,
+        f"{option}: the camera trained {request.scene}",
+        remedy=f"name one that did not: any but {', '.join(scene.cameras)}",
+        error=UsageError,
+    )
+    refuse_if(
+        every is not None and scene.run.get("metrics", {}).get(EVERY) != every,
+        f"{option}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
+        remedy="name a camera that did not, or give --lockstep, which leaves these sets out",
+        error=UsageError,
+    )
 
 
 def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> SourceOptions:
@@ -109,11 +118,12 @@ def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> Source
     Raises UsageError without another one.
     """
     others = tuple(camera for camera in cameras if camera != request.evidence)
-    if not others:
-        raise UsageError(
-            f"--evidence {request.evidence}: no other camera is left to train on",
-            remedy="leave out frame sets instead, such as every 4th with --evidence 4",
-        )
+    refuse_if(
+        not others,
+        f"--evidence {request.evidence}: no other camera is left to train on",
+        remedy="leave out frame sets instead, such as every 4th with --evidence 4",
+        error=UsageError,
+    )
     return replace(request.options, cameras=others)
 
 
@@ -130,20 +140,19 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
         chosen = open_scene(request.scene).cameras
     source = open_states(request.log, replace(request.options, cameras=chosen), model.joint_names)
     name = f"camera {request.evidence}" if every is None else f"each frame set of {every}"
-    if not source.cameras:
-        raise InputError(f"{request.log}: --evidence: expected cameras, got joint states alone")
-    if not source.has_clock:
-        raise InputError(f"{request.log}: --evidence: expected frames with times, got views without")
+    refuse_if(not source.cameras, f"{request.log}: --evidence: expected cameras, got joint states alone")
+    refuse_if(not source.has_clock, f"{request.log}: --evidence: expected frames with times, got views without")
     evidence = Evidence(
         source=source,
         cameras=source.cameras if every is None else tuple(training_cameras(source)),
         name=name,
         every=every,
     )
-    if not any(step.has_depth for step in evidence.frame_sets()):
-        raise InputError(
-            f"{request.log}: --evidence: {name} has no pixel with depth", remedy="name a camera with depth"
-        )
+    refuse_if(
+        not any(step.has_depth for step in evidence.frame_sets()),
+        f"{request.log}: --evidence: {name} has no pixel with depth",
+        remedy="name a camera with depth",
+    )
     return evidence
 
 

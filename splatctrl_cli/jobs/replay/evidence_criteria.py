@@ -201,13 +201,6 @@ def bound_words(bound: ConformalBound) -> str:
     )
 
 
-def belonging(judged: Judged) -> Iterator[Reason]:
-    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links.
-    Files are as written, and splats agree with their occupancy grid.
-    """
-    yield from judged.inputs.mismatches
-
-
 def find_displaced(judged: Judged) -> tuple[str, float] | None:
     """The worst uncorrected displaced camera and its offset [m]; None without any."""
     rows = judged.inputs.scene.figures().get("displaced_cameras") or {}
@@ -293,7 +286,13 @@ BLIND = Bound(
 
 OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="map error", find=map_error, broken=UNKNOWN),
-    Criterion(name="evidence", find=belonging, broken=f"{UNKNOWN}; a changed file is refused (exit 4)"),
+    Criterion(
+        name="evidence",
+        find=attrgetter("inputs.mismatches"),
+        meaning="scene, log and robot belong together: digests, first frames, calibration, times, joints, links; "
+        "files as written; splats that agree with their occupancy grid",
+        broken=f"{UNKNOWN}; a changed file is refused (exit 4)",
+    ),
     Criterion(name="calibration", find=calibration, broken=UNKNOWN),
     Criterion(name="map resolution", find=map_resolution, broken=UNKNOWN),
     Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),

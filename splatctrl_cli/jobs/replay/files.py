@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, UNITS, Event, EventKind, first_intervention
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN, UNITS, Event, EventKind, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.files.output import Stopwatch, finite, write_json, write_run
@@ -59,8 +59,7 @@ def columns_of(replay: Replay, rows: slice = slice(None)) -> Cells:
     }
     by_field = [name for field in replay.fields for name in (f"clearance_{field}", f"nearest_{field}")]
     for name in ("q", *by_field, *(name for name in COLUMNS if name in trace)):
-        values = trace.rows(name)[rows]
-        if isinstance(values, list):
+        if isinstance(values := trace.rows(name)[rows], list):
             columns[name] = values
         elif values.ndim == 1:
             columns[name] = ["" if name in OF_STEP and np.isnan(v) else v for v in values.tolist()]
@@ -210,9 +209,8 @@ def draw_replay(folder: Path, replay: Replay) -> None:
     if "clearance_true" in trace:
         curves["truth"] = trace.rows("clearance_true")
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
-    title = TITLES[replay.mode]
-    if replay.closed_loop is not None and replay.start_time_s > 0:
-        title += f", from {replay.start_time_s:.2f} s of the log"
+    is_late = replay.closed_loop is not None and replay.start_time_s > 0
+    title = TITLES[replay.mode] + (f", from {replay.start_time_s:.2f} s of the log" if is_late else "")
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
     if np.isfinite(shares := trace["class_shares"]).any():
         evidence_picture(folder / "evidence.png", seconds, shares)
@@ -259,13 +257,10 @@ def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterabl
     None where no camera has one. Frames after the last moment are not read.
     """
     trace = replay.trace
-    least = trace["clearance_exact"]
-    if "clearance_true" in trace:
-        least = np.fmin(least, trace["clearance_true"])
+    least = np.fmin(trace["clearance_exact"], trace.get("clearance_true", np.nan))
     states = worst_moments(trace.stamp_ns, least, num)
-    if not states or not inputs.source.has_clock:
-        return []
-    return sights_of([_moment(inputs, replay, state) for state in states], frames)
+    moments = [_moment(inputs, replay, state) for state in states if inputs.source.has_clock]
+    return sights_of(moments, frames) if moments else []
 
 
 def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
@@ -280,9 +275,9 @@ def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | Non
             f"{frame.camera}, taken {(moment.stamp_ns - frame.stamp_ns) * 1e-9:.2f} s before; spheres of the {whose}",
         )
         draw_sight(folder / f"worst_{number}.png", replace(moment, caption=caption), frame)
-    if len(seen) < len(sights):
-        return [f"worst frames: no camera image at or before {len(sights) - len(seen)} of {len(sights)} moments"]
-    return []
+    num_without = len(sights) - len(seen)
+    note = f"worst frames: no camera image at or before {num_without} of {len(sights)} moments"
+    return [note] if num_without else []
 
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:

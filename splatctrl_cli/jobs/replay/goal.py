@@ -26,12 +26,11 @@ from splatctrl_cli.control.policy import PolicyClient, RecordedImages, is_policy
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.control.step import OURS, Commander
-from splatctrl_cli.errors import InputError, UsageError, refuse_faults, require
+from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if, require
 from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay.trace import Trace
+from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest, Trace
 from splatctrl_cli.jobs.running.progress import Progress
 from splatctrl_cli.recording.state.state_source import read_twists
 from splatctrl_cli.records import Float64, Stamps
@@ -101,8 +100,7 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
     with refuse_faults(f"{path}: cannot be read", OSError, UnicodeDecodeError, remedy=remedy):
         text = path.read_text(encoding="utf-8")
     rows = list(_csv_rows(path, text, model.joint_names) if path.suffix == ".csv" else _toml_rows(path, text))
-    if not rows:
-        raise InputError(f"{path}: expected at least one waypoint, got none")
+    refuse_if(not rows, f"{path}: expected at least one waypoint, got none")
     waypoints = []
     for number, (kind, row) in enumerate(rows):
         what = f"{path}: waypoint {number}"
@@ -119,11 +117,10 @@ def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint,
 def _csv_rows(path: Path, text: str, joints: tuple[str, ...]) -> Iterator[tuple[str, list[float]]]:
     reader = csv.DictReader(text.splitlines())
     header = tuple(reader.fieldnames or ())
-    wanted = next((names for names in (POSE_COLUMNS, joints) if set(names) <= set(header)), None)
-    if wanted is None:
-        raise InputError(
-            f"{path}: expected the columns {POSE} or {','.join(joints)}, got {','.join(header) or 'none'}"
-        )
+    wanted = require(
+        next((names for names in (POSE_COLUMNS, joints) if set(names) <= set(header)), None),
+        f"{path}: expected the columns {POSE} or {','.join(joints)}, got {','.join(header) or 'none'}",
+    )
     for number, row in enumerate(reader):
         try:
             yield "pose" if wanted is POSE_COLUMNS else "joints", [float(row[name]) for name in wanted]
@@ -136,22 +133,32 @@ def _toml_rows(path: Path, text: str) -> Iterator[tuple[str, list[float]]]:
         document: dict[str, Any] = tomllib.loads(text)
     entries = document.get("waypoint", [])
     for number, entry in enumerate(entries if isinstance(entries, list) else [entries]):
-        if not isinstance(entry, dict) or len(entry) != 1 or not set(entry) <= {"pose", "joints"}:
-            raise InputError(f"{path}: waypoint {number}: expected pose = [...] or joints = [...], got {entry}")
+        refuse_if(
+            not isinstance(entry, dict) or len(entry) != 1 or not set(entry) <= {"pose", "joints"},
+            f"{path}: waypoint {number}: expected pose = [...] or joints = [...], got {entry}",
+        )
         ((kind, values),) = entry.items()
-        if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
-            raise InputError(f"{path}: waypoint {number}: {kind}: expected an array of numbers, got {values}")
+        refuse_if(
+            not isinstance(values, list) or not all(type(value) in (int, float) for value in values),
+            f"{path}: waypoint {number}: {kind}: expected an array of numbers, got {values}",
+        )
         yield kind, [float(value) for value in values]
 
 
 def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists without a controller, or a frame without twists."""
-    if request.twist_topic is not None and request.mode == "audit":
-        raise UsageError(
-            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit uses no controller"
-        )
-    if request.twist_frame is not None and request.twist_topic is None:
-        raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
+    refuse_if(
+        request.twist_topic is not None and request.mode == "audit",
+        "--twist-topic: expected --mode open-loop or closed-loop",
+        remedy="an audit uses no controller",
+        error=UsageError,
+    )
+    refuse_if(
+        request.twist_frame is not None and request.twist_topic is None,
+        "--twist-frame: expected --twist-topic",
+        remedy="leave it out",
+        error=UsageError,
+    )
 
 
 def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, console: Progress) -> TwistTrack | None:
@@ -163,18 +170,18 @@ def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, co
         return None
     logged = read_twists(request.log, request.twist_topic)
     frame = logged.frame if request.twist_frame is None else request.twist_frame
-    if frame != WORLD and frame not in model.frame_names:
-        raise InputError(
-            f"{logged.where}: expected twists in world or a link of the robot, got frame {frame!r}",
-            remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
-        )
+    refuse_if(
+        frame != WORLD and frame not in model.frame_names,
+        f"{logged.where}: expected twists in world or a link of the robot, got frame {frame!r}",
+        remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
+    )
     first, last = int(logged.stamp_ns[0]), int(logged.stamp_ns[-1])
-    if last < states_ns[0] or first > states_ns[-1]:
-        raise InputError(
-            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {states_ns[0]} and "
-            f"{states_ns[-1]} ns, got {first} to {last} ns",
-            remedy="record both by one clock",
-        )
+    refuse_if(
+        last < states_ns[0] or first > states_ns[-1],
+        f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {states_ns[0]} and "
+        f"{states_ns[-1]} ns, got {first} to {last} ns",
+        remedy="record both by one clock",
+    )
     from_s, to_s = ((stamp - states_ns[0]) * 1e-9 for stamp in (first, last))
     console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
     for note in logged.notes:
@@ -217,19 +224,24 @@ def twist_figures(
 def check_controller(request: ReplayRequest) -> None:
     """Raise UsageError for a controller in an audit, an invalid one, or its options alone."""
     if request.controller is None and request.controller_command is None:
-        if request.controller_twice or request.controller_step_limit != STEP_LIMIT:
-            raise UsageError(
-                "--controller-twice, --controller-step-limit: expected a controller",
-                remedy="give --controller or --controller-command, or leave them out",
-            )
-        return
-    if request.controller is not None and request.controller_command is not None:
-        raise UsageError("--controller, --controller-command: expected one of them, got both")
-    if request.mode == "audit":
-        raise UsageError(
-            "--controller, --controller-command: expected --mode open-loop or closed-loop",
-            remedy="an audit uses no controller",
+        refuse_if(
+            request.controller_twice or request.controller_step_limit != STEP_LIMIT,
+            "--controller-twice, --controller-step-limit: expected a controller",
+            remedy="give --controller or --controller-command, or leave them out",
+            error=UsageError,
         )
+        return
+    refuse_if(
+        request.controller is not None and request.controller_command is not None,
+        "--controller, --controller-command: expected one of them, got both",
+        error=UsageError,
+    )
+    refuse_if(
+        request.mode == "audit",
+        "--controller, --controller-command: expected --mode open-loop or closed-loop",
+        remedy="an audit uses no controller",
+        error=UsageError,
+    )
     if is_policy_server(request.controller or ""):
         parse_address(request.controller or "")
     elif request.controller != RECORDED:
@@ -281,14 +293,14 @@ def _connector(request: ReplayRequest, inputs: ReplayInputs) -> tuple[str, Conne
 
 def _read_command(request: ReplayRequest) -> tuple[str, tuple[str, ...]]:
     if request.controller is not None:
-        if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller):
-            raise UsageError(f"--controller: expected module:Class, got {request.controller!r}")
+        refuse_if(
+            not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", request.controller),
+            f"--controller: expected module:Class, got {request.controller!r}",
+            error=UsageError,
+        )
         return request.controller, class_command(request.controller)
     text = request.controller_command or ""
-    try:
+    with refuse_faults(f"--controller-command {text!r}", ValueError, remedy="close the quotes", error=UsageError):
         words = shlex.split(text)
-    except ValueError as error:
-        raise UsageError(f"--controller-command {text!r}: {error}", remedy="close the quotes") from None
-    if not words:
-        raise UsageError("--controller-command: expected a program and its arguments, got nothing")
+    refuse_if(not words, "--controller-command: expected a program and its arguments, got nothing", error=UsageError)
     return text, tuple(words)

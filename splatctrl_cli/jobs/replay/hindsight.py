@@ -1,6 +1,6 @@
 """Obstacles that only later depth shows where the arm was."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -74,8 +74,7 @@ class NewerDepth:
         stamps = np.array([stamp for stamp, _ in states])
         clearance = self._clearance_in(known_ns, stamps, np.array([q for _, q in states]))
         worst = int(clearance.argmin())
-        depth_ns = self._scene.depth_ns(known_ns)
-        if clearance[worst] < self._margin and depth_ns is not None:
+        if clearance[worst] < self._margin and (depth_ns := self._scene.depth_ns(known_ns)) is not None:
             self.later.append(
                 LaterDepth(depth_ns=depth_ns, stamp_ns=int(stamps[worst]), clearance=float(clearance[worst]))
             )
@@ -114,17 +113,11 @@ class Hindsight:
         if not self._stamps or self._seen_ns is None:
             return
         last_ns, last = self._stamps[-1], self._postures[-1]
-        for stamp_ns in self._later(last_ns):
-            if (known := self._scene.seen_at(stamp_ns)) is not None:
+        shown = self._scene.age_s(last_ns)
+        for stamp_ns in range(last_ns + STEP_NS, last_ns + UNWATCHED_AFTER_NS, STEP_NS):
+            is_newer = self._stamps and self._scene.age_s(stamp_ns) < shown + (stamp_ns - last_ns) * 1e-9 - 1e-6
+            if is_newer and (known := self._scene.seen_at(stamp_ns)) is not None:
                 self.looked(stamp_ns, self._near.look(stamp_ns, last, known).age)
-            if not self._stamps:
-                return
-
-    def _later(self, stamp_ns: int) -> Iterator[int]:
-        shown = self._scene.age_s(stamp_ns)
-        for later_ns in range(stamp_ns + STEP_NS, stamp_ns + UNWATCHED_AFTER_NS, STEP_NS):
-            if self._scene.age_s(later_ns) < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
-                yield later_ns
 
     def _hold_against(self, since_ns: int, until_ns: int, num: int) -> None:
         stamps, q = np.array(self._stamps[:num]), np.asarray(self._postures[:num])

@@ -15,7 +15,7 @@ from splatctrl_cli.checks.clock_offset import (
 )
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if, require
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replay.request import ReplayRequest
@@ -57,15 +57,20 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
     Raises InputError for a log without joint states, UsageError for an unknown robot.
     """
-    urdf = urdf_of(request.urdf, (request.log,), progress)
-    if urdf is None:
-        raise UsageError(f"replay: {request.log} does not describe the robot", remedy="give it with --urdf FILE")
+    refuse_if(not request.log.exists(), f"{request.log}: no such file or folder", remedy="check the path")
+    urdf = require(
+        urdf_of(request.urdf, (request.log,), progress),
+        f"replay: {request.log} does not describe the robot",
+        remedy="give it with --urdf FILE",
+        error=UsageError,
+    )
     model = request.posed(urdf)
     source = open_states(request.log, request.options, model.joint_names)
-    if not source.joint_names:
-        raise InputError(
-            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
-        )
+    refuse_if(
+        not source.joint_names,
+        f"{request.log}: expected joint states, got none",
+        remedy="replay needs a log with /joint_states",
+    )
     if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
         progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
     return add_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
@@ -101,7 +106,16 @@ def measured_robot(
         )
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
-        _check_bounded(model)
+        refuse_if(
+            model.coverage is None,
+            f"control.coverage = margin: {model.coverage_unknown}",
+            remedy="or set control.coverage = report, which needs no meshes",
+        )
+        refuse_if(
+            bare := bare_moving_links(model),
+            f"control.coverage = margin: expected spheres on every link that moves, got none on {', '.join(bare)}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
+        )
     kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
     fixtures = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
     model = apply_kept_margins(model, config.self_margin, kept)
@@ -184,19 +198,6 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
         )
     bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
     return words + bare
-
-
-def _check_bounded(model: RobotModel) -> None:
-    wanted = "control.coverage = margin"
-    if model.coverage is None:
-        raise InputError(
-            f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
-        )
-    if bare := bare_moving_links(model):
-        raise InputError(
-            f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
-            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
-        )
 
 
 def bare_moving_links(model: RobotModel) -> list[str]:

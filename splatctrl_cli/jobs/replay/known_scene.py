@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, Observed, observed_at
 from splatctrl_cli.control.barriers import SceneStep, guard_people
-from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
+from splatctrl_cli.control.columns import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, refuse_if
 from splatctrl_cli.field.clusters import NO_SPLAT, ObstacleSpheres, Spheres, obstacle_spheres
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid_cells import GridField, exact_channel
@@ -128,8 +128,12 @@ def fields_at(
 
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(known_ns, stamp_ns) - 1
-        if index < 0:
-            raise NotEvaluableError(f"no map is known yet at stamp {stamp_ns} ns", remedy="give a later time")
+        refuse_if(
+            index < 0,
+            f"no map is known yet at stamp {stamp_ns} ns",
+            remedy="give a later time",
+            error=NotEvaluableError,
+        )
         return kept(key_of(index))
 
     return at
@@ -176,10 +180,12 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
     has_times = scene.has_clock and bool(scene.snapshots)
-    if latency_ns and not has_times:
-        raise UsageError(
-            f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
-        )
+    refuse_if(
+        latency_ns and not has_times,
+        f"--latency: {path} is one scene for all times: expected snapshots",
+        remedy="leave --latency out",
+        error=UsageError,
+    )
 
     known_ns = tuple(stamp + latency_ns for stamp in stamps)
 

@@ -15,7 +15,7 @@ from splatctrl_cli.calibration.displacement import displaced_cameras
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError, refuse_if, require
 from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.formats.scene.scene_folder import MAP_DELAYS
 from splatctrl_cli.formats.scene.voxel_file import read_seen, read_unrepresented
@@ -52,14 +52,30 @@ END: tuple[TimeStep | None, float] = (None, 0.0)  # of the frame sets
 
 def check_lockstep(request: ReplayRequest) -> None:
     """Raise UsageError for options without effect."""
-    if request.latency and request.field is not None:
-        raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
-    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP):
-        raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
-    if request.real_time and not request.lockstep:
-        raise UsageError("--real-time: expected --lockstep, as other maps exist already", remedy="leave it out")
-    if not request.lockstep and request.device.startswith(CUDA):
-        raise UsageError(f"--device {request.device}: expected --lockstep, as only a fit uses a GPU", remedy=TO_CPU)
+    refuse_if(
+        request.latency and request.field is not None,
+        "--latency: a baked field is one scene for all times",
+        remedy="give --scene or --lockstep",
+        error=UsageError,
+    )
+    refuse_if(
+        not request.lockstep and (request.allow_disagreement or request.max_pose_jump != fixed.POSE_JUMP),
+        "--allow-disagreement, --max-pose-jump: expected --lockstep",
+        remedy="leave them out",
+        error=UsageError,
+    )
+    refuse_if(
+        request.real_time and not request.lockstep,
+        "--real-time: expected --lockstep, as other maps exist already",
+        remedy="leave it out",
+        error=UsageError,
+    )
+    refuse_if(
+        not request.lockstep and request.device.startswith(CUDA),
+        f"--device {request.device}: expected --lockstep, as only a fit uses a GPU",
+        remedy=TO_CPU,
+        error=UsageError,
+    )
 
 
 def choose_scene(
@@ -76,10 +92,12 @@ def choose_scene(
     `observe` is called with every frame of that log.
     """
     if request.field is not None:
-        if request.config.control.human_margin > request.config.control.margin:
-            raise UsageError(
-                "control.human_margin: a baked field does not tell people from objects", remedy="give --scene"
-            )
+        refuse_if(
+            request.config.control.human_margin > request.config.control.margin,
+            "control.human_margin: a baked field does not tell people from objects",
+            remedy="give --scene",
+            error=UsageError,
+        )
         return read_grid_scene(request.field)
     if request.scene is not None:
         return read_splat_scene(
@@ -289,13 +307,10 @@ class Lockstep:
             seed=fitted.request.seed,
         )
         fitted.device.close()
-        self._console.log(self._speed())
-
-    def _speed(self) -> str:
         stamps_ns, seconds = zip(*self._taking, strict=True)
         middle, most = (f"{1e3 * float(t):.0f} ms" for t in np.percentile(seconds, [50, 99]))
         apart = f", recorded {1e-6 * float(np.median(np.diff(stamps_ns))):.0f} ms apart" if len(stamps_ns) > 1 else ""
-        return (
+        self._console.log(
             f"lockstep: {len(seconds)} frame sets{apart}, took {middle} each in the median, {most} at 99 %; their"
             f" maps are in {FOLDER}/"
         )
@@ -303,13 +318,16 @@ class Lockstep:
 
 def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:
     source = open_states(request.log, request.options, model.joint_names) if source is None else source
-    if not source.cameras:
-        raise InputError(
-            f"{request.log}: --lockstep: expected cameras, got joint states alone",
-            remedy="give --scene or --field of the same place",
-        )
+    refuse_if(
+        not source.cameras,
+        f"{request.log}: --lockstep: expected cameras, got joint states alone",
+        remedy="give --scene or --field of the same place",
+    )
     if request.evidence in source.cameras:
         source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
-    if not isinstance(source, LOGGED):
-        raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
-    return source
+    return require(
+        source if isinstance(source, LOGGED) else None,
+        f"{request.log}: --lockstep: expected a log or a capture",
+        remedy="give --scene or --field",
+        error=UsageError,
+    )

@@ -7,8 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, fixed
-from splatctrl_cli.control.columns import RUNGS
-from splatctrl_cli.control.events import first_intervention
+from splatctrl_cli.control.columns import RUNGS, first_intervention
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
@@ -205,10 +204,8 @@ OF_STATES: Declared = (
 
 
 def _rung(rung: Rung) -> Measure:
-    name, scale = "num_" + rung.value.replace("-", "_"), FAULTS
-    if rung is Rung.SOLVED:
-        scale = Scale(better=Better.HIGHER, relative=0.05)
-    number = RUNGS.index(rung)
+    name, number = "num_" + rung.value.replace("-", "_"), RUNGS.index(rung)
+    scale = Scale(better=Better.HIGHER, relative=0.05) if rung is Rung.SOLVED else FAULTS
     measure = _of("rung_number", name, NUMBER, scale, where=lambda _, rungs: rungs == number, shown="rung")
     return replace(measure, pick=rung.value)
 

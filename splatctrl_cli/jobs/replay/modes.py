@@ -19,7 +19,7 @@ from splatctrl_cli.control.replay import (
     open_loop,
 )
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError, refuse_if
 from splatctrl_cli.files.spilled_rows import ObjectFile
 from splatctrl_cli.jobs.recordings.provenance import times_apart
 from splatctrl_cli.jobs.replay.goal import commander_of, goal_waypoints, twist_figures, twist_track
@@ -35,8 +35,7 @@ from splatctrl_cli.records import Float64, Stamps
 def replayed(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
-    mode = {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode]
-    return mode(request, inputs, console)
+    return {"audit": _audit, "open-loop": _ask, "closed-loop": _drive}[request.mode](request, inputs, console)
 
 
 def _audit(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Replay:
@@ -211,12 +210,12 @@ def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
     if request.start_time == "first-map":
         return max(int(stamps[0]), int(stamps[0]) if scene.first_ns is None else scene.first_ns)
     start = int(stamps[0]) + round(float(request.start_time) * 1e9)
-    if start > stamps[-1]:
-        raise InputError(
-            f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
-            f"got {(start - stamps[0]) * 1e-9:.2f} s",
-            remedy="give an earlier --start-time",
-        )
+    refuse_if(
+        start > stamps[-1],
+        f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
+        f"got {(start - stamps[0]) * 1e-9:.2f} s",
+        remedy="give an earlier --start-time",
+    )
     return start
 
 

@@ -8,7 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
-from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.control.columns import Event, EventKind
 from splatctrl_cli.evaluate.metrics import lowest
 from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, lacking, passed_reason, plural
 from splatctrl_cli.jobs.replay.criteria import (
@@ -205,8 +205,7 @@ def _brought_together(judged: Judged) -> Reason | None:
     for pair, (gap, stamp) in sorted(replay.closest.items(), key=lambda item: item[1][0] - item[0].apart):
         if pair.is_fixture or gap >= pair.apart - SLIGHTLY_UNDER:
             continue
-        before = least_gap(inputs.model, inputs.surfaces, pair, recorded)
-        if gap < before - SLIGHTLY_UNDER:
+        if gap < (before := least_gap(inputs.model, inputs.surfaces, pair, recorded)) - SLIGHTLY_UNDER:
             bound = f"at least {mm(before)}" if before < pair.apart else f"{mm(pair.apart)} or more"
             return failed(
                 sentence=f"{' and '.join(pair.links)} were driven to {mm(gap)} apart, recorded {bound}: "

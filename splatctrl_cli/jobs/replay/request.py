@@ -1,32 +1,87 @@
-"""A replay's request, inputs and result."""
+"""A replay's request, inputs and result, with its trace in files."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from splatctrl_cli.config import Config, fixed
-from splatctrl_cli.control.events import Event
+from splatctrl_cli.control.columns import Event, NamedColumns
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.outside import STEP_LIMIT, OutsideController
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
-from splatctrl_cli.control.separation_file import DeclaredSeparation
+from splatctrl_cli.control.separation import DeclaredSeparation
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Reason
+from splatctrl_cli.files.spilled_rows import ObjectFile, RowFile, Rows
 from splatctrl_cli.jobs.reconstruct.verdict import LONGEST_BLIND
 from splatctrl_cli.jobs.replay.hindsight import LaterDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
-from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.device import RunOptions
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import RecordSource
+from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_margins import KeptMargin, SelfSurfaces
 from splatctrl_cli.simulate.truth import Truth
+
+BLOCK = 1024  # states that are replayed at once
+
+
+class Trace(Mapping[str, Any]):
+    """T states as `NamedColumns`, appended in blocks.
+
+    Words name who or where: `nearest_exact` of `clearance_exact`.
+    """
+
+    def __init__(self) -> None:
+        self._columns: dict[str, RowFile | ObjectFile[Any]] = {}
+
+    def append(self, columns: NamedColumns) -> None:
+        """Append a block to some columns."""
+        for name, values in columns.items():
+            if name not in self._columns:
+                dtype = np.int64 if name == "stamp_ns" else np.float64
+                is_words = isinstance(values, list)
+                self._columns[name] = ObjectFile() if is_words else RowFile(values.shape[1:], dtype=dtype)
+            if isinstance(file := self._columns[name], RowFile):
+                file.append(values)
+            else:
+                file.extend(values)
+
+    def __len__(self) -> int:
+        """The number of columns."""
+        return len(self._columns)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __getitem__(self, name: str) -> Any:
+        """All numbers (T, ...) of a column, or its words (T,), read where needed."""
+        column = self.rows(name)
+        return np.asarray(column) if isinstance(column, Rows) else column
+
+    def rows(self, name: str) -> Any:
+        """A column (T, ...), read where needed: `Rows` of numbers, or words."""
+        file = self._columns[name]
+        return Rows(file) if isinstance(file, RowFile) else file
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        """Stamps (T,) [ns]."""
+        return np.asarray(self["stamp_ns"], dtype=np.int64)
+
+    def seconds(self, index: int) -> float:
+        """Time [s] of a state since the first."""
+        stamps = self.rows("stamp_ns")
+        return float(stamps[index] - stamps[0]) * 1e-9
+
 
 MODES = ("audit", "open-loop", "closed-loop")
 JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged by a table, or an obstacle
@@ -85,7 +140,6 @@ class ReplayRequest(RobotOptions, RunOptions):
     separation: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,15 +11,22 @@ from splatctrl_cli.config.fixed import MISPLACED
 from splatctrl_cli.control.audit import BallDistance, DistanceFunction, part_clearances
 from splatctrl_cli.control.columns import NamedColumns
 from splatctrl_cli.control.near_space import NEVER_SEEN, Seen
-from splatctrl_cli.control.separation import PERSON_SPEED, Approach, ArmMotion, Stop
-from splatctrl_cli.control.separation_file import ANYTHING, LABELLED, PERSON, DeclaredSeparation
+from splatctrl_cli.control.separation import (
+    ANYTHING,
+    LABELLED,
+    PERSON,
+    PERSON_SPEED,
+    Approach,
+    ArmMotion,
+    DeclaredSeparation,
+    Stop,
+)
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.field.clusters import Spheres
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.jobs.replay.metrics import Metrics
-from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SeparationInput
+from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, SeparationInput, Trace
 from splatctrl_cli.jobs.replay.state_pass import blocks_of
-from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.records import Bool, Float64, Floats
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
@@ -167,8 +174,7 @@ class _SeparationPass:
             f"{inputs.source.name}: --separation: the maps have no times",
             remedy="reconstruct with snapshots, or give --lockstep",
         )
-        seconds = np.diff(replay.trace.stamp_ns) * 1e-9
-        self._seconds = np.append(seconds, 0.0)
+        self._seconds = np.append(np.diff(replay.trace.stamp_ns) * 1e-9, 0.0)
         self.surfaces = _Surfaces(declared, inputs)
 
     def columns(self, first: int, last: int) -> NamedColumns:
@@ -208,15 +214,14 @@ class _SeparationPass:
         self, robot: RobotModel, q: Float64, centers: Float64, people: "_Balls | None", speed: Float64
     ) -> ArmMotion:
         points = centers[:, self._moving]
-        gradient = np.zeros(points.shape)
-        if people is not None:
-            gradient = people.field.query(np.ascontiguousarray(points.reshape(-1, 3)))[1].reshape(points.shape)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        gradient = np.zeros_like(flat) if people is None else people.field.query(flat)[1]
         reached = np.linalg.norm(points - robot.base_position, axis=2) + robot.sphere_set.radii[self._moving]
         return ArmMotion(
             joint_speed=speed,
             velocity_limit=robot.velocity_limit,
             jacobian=np.array([robot.spheres_at(posture)[1][self._moving] for posture in q]),
-            gradient=gradient,
+            gradient=gradient.reshape(points.shape),
             extension=reached.max(axis=1) / (self._declared.reach or np.inf),
         )
 

@@ -19,22 +19,24 @@ from splatctrl_cli.control.audit import (
     observed_at,
     part_clearances,
 )
-from splatctrl_cli.control.columns import NamedColumns, audit_columns, names_at
-from splatctrl_cli.control.events import (
+from splatctrl_cli.control.columns import (
     Event,
     EventKind,
+    NamedColumns,
     Obstacle,
+    audit_columns,
     audit_signals,
     events_of,
     motion_signals,
+    names_at,
     step_signals,
 )
-from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NEVER_SEEN, Account, NearSpace
 from splatctrl_cli.control.preconditions import FixedParts
+from splatctrl_cli.control.terms import MotionLimits
 from splatctrl_cli.jobs.replay.hindsight import Hindsight, NewerDepth
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene
-from splatctrl_cli.jobs.replay.trace import BLOCK, Trace
+from splatctrl_cli.jobs.replay.request import BLOCK, Trace
 from splatctrl_cli.records import Bool, Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -295,8 +297,7 @@ class ReplayRecord:
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         nearest = part.clearance["barrier"]
         found: list[Obstacle | None] = [None] * len(part.stamp_ns)
-        states = np.flatnonzero(np.isfinite(nearest.distance))
-        if len(states):
+        if len(states := np.flatnonzero(np.isfinite(nearest.distance))):
             centers = self._model.sphere_centers_batch(part.position[states])
             points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
             obstacles = self._scene.at(int(part.stamp_ns[0])).obstacles(points)

@@ -7,7 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
-from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.columns import runs_of
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, plural
 from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Judged, mm, worst_state
 
@@ -152,8 +152,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             count=len(stamps),
         )
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
-    share = float(unbounded.sum()) / duration
-    if share > config.unjudged:
+    if (share := float(unbounded.sum()) / duration) > config.unjudged:
         longest = int(np.argmax(unbounded))
         yield lacking(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN
+from splatctrl_cli.control.columns import INTERVENTIONS, SHOWN
 from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, FigureChange, compare
 from splatctrl_cli.jobs.runs.run_folder import RunFolder
 from splatctrl_cli.report.page import Cell, Row, RunSection, Table, picture
@@ -197,16 +197,12 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
         for one in found.verdicts
     ]
     unlike = [(("", name, *values, "not alike", "", "", ""), "") for name, values in found.differences.items()]
-    tables = [
-        Table(
-            title="What changed",
-            header=HEADER,
-            rows=[*first, *rows(worse), *unlike],
-            text=". ".join([found.verdict.sentence, *map(str, found.verdict.shown)]),
-        )
-    ]
-    if better:
-        tables.append(
-            Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
-        )
+    changed = Table(
+        title="What changed",
+        header=HEADER,
+        rows=[*first, *rows(worse), *unlike],
+        text=". ".join([found.verdict.sentence, *map(str, found.verdict.shown)]),
+    )
+    folded = Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
+    tables = [changed, folded] if better else [changed]
     return tables, frozenset([one["run"] for one in found.verdicts] + [one.run for one in worse])

@@ -76,11 +76,11 @@ def space_of_grid(path: Path) -> Space:
         surface = Surface(vertices=found.vertices.astype(np.float32), faces=found.faces.astype(np.uint32))
     except NotEvaluableError:
         surface = None
-    space = Space(surface=surface)
-    if "observed" not in grid.channels:
-        return space
-    is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
-    return replace(space, unknown=coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN))
+    unknown = None
+    if "observed" in grid.channels:
+        is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
+        unknown = coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN)
+    return Space(surface=surface, unknown=unknown)
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
@@ -156,12 +156,12 @@ def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
     """Scene of a replay's command line. Raises InputError if missing."""
     given = run.option("--scene")
     folder = run.path / "scene" if given is None else run.place_of(given, roots)
-    if folder is None or not folder.exists():
-        raise InputError(
-            f"{run.path}: the scene {given or 'scene/'} of its command line is not found",
-            remedy="give the folder that it was relative to with --root",
-        )
-    return open_scene(folder)
+    found = require(
+        folder if folder is not None and folder.exists() else None,
+        f"{run.path}: the scene {given or 'scene/'} of its command line is not found",
+        remedy="give the folder that it was relative to with --root",
+    )
+    return open_scene(found)
 
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
@@ -179,10 +179,8 @@ def spread(times: list[float], when: float) -> list[int]:
     """Indices of at most 5 of `times`: first, last, the one at `when`, others evenly."""
     if not times:
         return []
-    count = len(times)
-    at = max((i for i, time in enumerate(times) if time <= when), default=0)
-    most = min(count, 5)
-    even = np.linspace(0, count - 1, most).round().astype(int).tolist()
+    at, most = max((i for i, time in enumerate(times) if time <= when), default=0), min(len(times), 5)
+    even = np.linspace(0, len(times) - 1, most).round().astype(int).tolist()
     nearest = min(range(most), key=lambda i: abs(even[i] - at))
     if 0 < nearest < most - 1:
         even[nearest] = at

@@ -263,8 +263,8 @@ def _verdict(
         unit="m",
         count=num,
     )
-    faults = _uncovered_links(report, urdf, allowed)
-    if faults and not any(parse_gate(requirement)[0] == "max_deficit" for requirement in require):
+    is_gated = any(parse_gate(requirement)[0] == "max_deficit" for requirement in require)
+    if (faults := _uncovered_links(report, urdf, allowed)) and not is_gated:
         covered = replace(
             covered,
             outcome=Outcome.FAILED,

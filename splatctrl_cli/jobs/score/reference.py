@@ -141,21 +141,24 @@ def cameras_to_score(
         return recorded
     if wanted is None:
         cameras = tuple(name for name in recorded if name not in training)
-        if cameras or (allow_training and recorded):
-            return cameras or recorded
-        raise UsageError(
+        refuse_if(
+            not cameras and not (allow_training and recorded),
             f"{reference.where}: each camera has the name of one that trained the scene ({', '.join(recorded)})",
             remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
+            error=UsageError,
         )
+        return cameras or recorded
     cameras = tuple(dict.fromkeys(wanted))
     if unknown := [name for name in cameras if name not in recorded]:
         raise InputError(f"{reference.where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
     trained = [name for name in cameras if name in training]
-    if trained and not allow_training:
-        raise UsageError(
-            f"--cameras {','.join(wanted)}: {trained[0]} trained the scene, its score says nothing about other views",
-            remedy="give a camera that was held out, or --allow-training",
-        )
+    refuse_if(
+        trained and not allow_training,
+        f"--cameras {','.join(wanted)}: {', '.join(trained[:1])} trained the scene, its score says nothing about"
+        " other views",
+        remedy="give a camera that was held out, or --allow-training",
+        error=UsageError,
+    )
     return cameras
 
 

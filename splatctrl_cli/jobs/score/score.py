@@ -82,9 +82,7 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> JudgedResult:
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
     with output_path(request.out, force=request.force, is_folder=True) if request.out else nullcontext() as folder:
-        if scenes:
-            return _score_scans(request, scenes, folder, progress)
-        return _score_scene(request, folder, progress)
+        return _score_scans(request, scenes, folder, progress) if scenes else _score_scene(request, folder, progress)
 
 
 def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> JudgedResult:

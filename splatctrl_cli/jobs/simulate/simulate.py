@@ -178,11 +178,11 @@ def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Re
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    sizes = {}
-    for path in sorted(folder.iterdir()):
-        parts = [path] if path.is_file() else [part for part in path.rglob("*") if part.is_file()]
-        sizes[path.name if path.is_file() else f"{path.name}/"] = sum(part.stat().st_size for part in parts)
-    return sizes
+    parts = {path: [path, *path.rglob("*")] for path in sorted(folder.iterdir())}
+    return {
+        path.name if path.is_file() else f"{path.name}/": sum(each.stat().st_size for each in its if each.is_file())
+        for path, its in parts.items()
+    }
 
 
 LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in time is better

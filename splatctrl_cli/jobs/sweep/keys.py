@@ -202,13 +202,13 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
 
 def _simulation_of(replayed: Stage) -> RunFolder:
     folder = Path(replayed.options.get("truth", "")).parent
-    simulation = open_run(folder) if (folder / "run.json").is_file() else None
-    if simulation is None or simulation.command != SIMULATE:
-        raise UsageError(
-            "--over obstacle-...: only of a simulated recording, by the folder that its --truth is in",
-            remedy="make one with splatctrl simulate, and replay that with --truth DIR/truth.json",
-        )
-    return simulation
+    found = open_run(folder) if (folder / "run.json").is_file() else None
+    return require(
+        found if found is not None and found.command == SIMULATE else None,
+        "--over obstacle-...: only of a simulated recording, by the folder that its --truth is in",
+        remedy="make one with splatctrl simulate, and replay that with --truth DIR/truth.json",
+        error=UsageError,
+    )
 
 
 def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:

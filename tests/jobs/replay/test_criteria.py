@@ -12,8 +12,7 @@ import pytest
 
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.audit import AuditTrace, Clearance
-from splatctrl_cli.control.columns import audit_columns, step_columns
-from splatctrl_cli.control.events import Event, EventKind, Signal, events_of
+from splatctrl_cli.control.columns import Event, EventKind, Signal, audit_columns, events_of, step_columns
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.step import ControlStep
@@ -25,9 +24,8 @@ from splatctrl_cli.jobs.replay.files import columns_of
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.known_scene import KnownScene
 from splatctrl_cli.jobs.replay.motion_criteria import OF_MOTION, clearance, surface_clearance, unlearned_link
-from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange
+from splatctrl_cli.jobs.replay.request import MapError, Replay, ReplayInputs, ReplayRequest, SceneChange, Trace
 from splatctrl_cli.jobs.replay.state_pass import NEAR_COLUMNS
-from splatctrl_cli.jobs.replay.trace import Trace
 from splatctrl_cli.recording.log.state_columns import StateColumns
 from splatctrl_cli.scene.self_mask import self_mask_metrics
 from splatctrl_cli.voxels import EvidenceClass

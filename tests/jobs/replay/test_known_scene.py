@@ -10,7 +10,7 @@ import trimesh
 from experiments.problems import simulated_arm
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import BallDistance
-from splatctrl_cli.control.events import Obstacle
+from splatctrl_cli.control.columns import Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.clusters import Spheres

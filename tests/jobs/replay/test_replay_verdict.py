@@ -11,7 +11,7 @@ from splatctrl_cli.checks.clock_offset import ClockOffset
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config.fixed import UNSEEN
 from splatctrl_cli.jobs.replay import replay as job
-from splatctrl_cli.jobs.replay.verdict import ASKED, CRITERIA
+from splatctrl_cli.jobs.replay.replay import ASKED, CRITERIA
 from tests.cli.replay_desk import SECOND, START, grid_seen
 from tests.jobs.replay.broken import (
     ALONE,
@@ -117,7 +117,7 @@ def test_an_object_that_may_be_a_part_of_the_arm_does_not_fail_a_driven_motion(
     scene, brief = stage.scene(), ("--set", "control.max_time=0.5")
     assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 1
     found = ("fore", "moves too little (3 of 5 configurations)")
-    monkeypatch.setattr("splatctrl_cli.jobs.replay.verdict.unlearned_link", lambda judged: found)
+    monkeypatch.setattr("splatctrl_cli.jobs.replay.replay.unlearned_link", lambda judged: found)
     assert stage.judged(*brief, scene=scene, mode="closed-loop")[0] == 5
     code, verdict = stage.judged(scene=scene)
     assert (code, verdict["label"]) == (1, "contact"), "of the logged motion only its own link's distance is in doubt"

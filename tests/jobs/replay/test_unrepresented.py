@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, ControlConfig
-from splatctrl_cli.control.events import UNREPRESENTED
+from splatctrl_cli.control.columns import UNREPRESENTED
 from splatctrl_cli.formats.grid.npz_grid import read_npz
 from splatctrl_cli.formats.scene.scene_folder import open_scene
 from splatctrl_cli.jobs.replay.known_scene import read_splat_scene, splat_fields

@@ -11,8 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.check import CheckRequest, check
-from splatctrl_cli.jobs.ingest import IngestRequest, ingest
+from splatctrl_cli.jobs.check import CheckRequest, IngestRequest, check, ingest
 from splatctrl_cli.jobs.reconstruct.reconstruct import _robot
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay.inputs import open_log

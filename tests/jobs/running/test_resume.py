@@ -207,7 +207,7 @@ def test_a_run_goes_on_only_as_what_it_was(
     before = {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
     given = list(interrupted)
     if changed == ["VERSION"]:
-        monkeypatch.setattr("splatctrl_cli.jobs.running.resume.__version__", "99")
+        monkeypatch.setattr("splatctrl_cli.jobs.running.device.__version__", "99")
         changed = []
     elif changed == ["URDF"]:
         other = tmp_path / "robot.urdf"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.score import lines_of
+from splatctrl_cli.cli.reconstruct import lines_of
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import space_out
 from splatctrl_cli.evaluate.protocols import score_protocol

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from experiments.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.planner.configuration_clearance import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
 
 
