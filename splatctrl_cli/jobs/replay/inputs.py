@@ -57,7 +57,8 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
     Raises InputError for a log without joint states, UsageError for an unknown robot.
     """
-    refuse_if(not request.log.exists(), f"{request.log}: no such file or folder", remedy="check the path")
+    lacks_robot = request.urdf is None and not request.log.exists()
+    refuse_if(lacks_robot, f"{request.log}: no such file or folder", remedy="check the path")
     urdf = require(
         urdf_of(request.urdf, (request.log,), progress),
         f"replay: {request.log} does not describe the robot",

@@ -114,6 +114,11 @@ def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given
         assert open_log(request)[0].joint_names == names
 
 
+def test_a_log_that_does_not_exist_is_named_before_its_robot(tmp_path: Path) -> None:
+    request = ReplayRequest(log=tmp_path / "none.mcap", out=tmp_path / "out")
+    expect_refusal("none.mcap: no such file or folder; check the path", open_log, request)
+
+
 def test_a_robot_that_is_said_twice_is_one(tmp_path: Path) -> None:
     twice = log_with(tmp_path / "twice.mcap", described(robot(), "/a/robot_description"), described(robot()))
     assert logged_urdf([twice]) is not None
