@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from splatctrl_cli.cli.common import (
+    BASE,
     BOX,
     CONFIG,
     CONFIG_FILE,
@@ -46,6 +47,7 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
     return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
 
 
+PLACED = (BASE, LOCK, PACKAGES)
 RECONSTRUCT = (
     option("SOURCE", "log, capture folder, or an image folder's .toml", Path, nargs="?", fields={"recording": Path}),
     option("--dtu ROOT", "instead, a DTU data set in the layout of MVSNet, or of IDR and NeuS", Path),
@@ -53,6 +55,7 @@ RECONSTRUCT = (
     option("--resume", "continue an interrupted run; the result has the same bytes"),
     option("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path),
     option("--spheres FILE.yaml", "its collision spheres", Path),
+    *PLACED,
     SELF_MODEL,
     option(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)", fields=AS_BOX),
     option(
@@ -349,9 +352,7 @@ REPLAY = (  # what people use, and in groups the rest
     *SOURCE,
     group(
         "robot",
-        option(f"--base {POSE}", "pose of the URDF's root in world (default: identity)", pose),
-        LOCK,
-        PACKAGES,
+        *PLACED,
         SELF_MODEL,
         option("--srdf FILE", "leave the pairs of its disable_collisions out of the self-collision rows", Path),
         DECLARE,
@@ -434,6 +435,7 @@ AUDIT = (
         option("--robot NAME", "or NAME.urdf of an installed Python package; an unknown name lists them"),
     ),
     option("--spheres FILE.yaml", "its spheres (default: the URDF's own, else fitted into the output)", Path),
+    *PLACED,
     either(
         option(f"--goal {POSE}", "also audit a closed loop to this pose, in world", pose),
         option("--goal-joints Q1,Q2,...", "or to this configuration [rad]", numbers),

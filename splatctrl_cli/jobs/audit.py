@@ -5,9 +5,10 @@ import json
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError, UsageError, WriteError, refuse_faults, refuse_if
@@ -29,7 +30,7 @@ from splatctrl_cli.jobs.render import render_newest
 from splatctrl_cli.jobs.replay.replay import check_request, replay
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.jobs.report.report import write_page_of_runs
-from splatctrl_cli.jobs.robot.logged_robot import installed_urdf, logged_urdf
+from splatctrl_cli.jobs.robot.logged_robot import RobotOptions, installed_urdf, logged_urdf
 from splatctrl_cli.jobs.running.device import RunOptions, deciding_versions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress
 from splatctrl_cli.jobs.runs.run_folder import open_run, read_object
@@ -53,7 +54,7 @@ TITLES = {LOGGED: "Logged motion", DRIVEN: "Driven motion", SCENE: "Map"}  # of 
 
 
 @dataclass(frozen=True, kw_only=True)
-class AuditRequest(RunOptions):
+class AuditRequest(RobotOptions, RunOptions):
     """An audit of `log`, read by `options`, into the folder `out`.
 
     urdf: the robot, or robot: its name, see `installed_urdf`; without both the log's own. spheres: None for the
@@ -67,7 +68,6 @@ class AuditRequest(RunOptions):
     options: SourceOptions = field(default_factory=SourceOptions)
     urdf: Path | None = None
     robot: str | None = None
-    spheres: Path | None = None
     goal: tuple[float, ...] | None = None
     goal_joints: tuple[float, ...] | None = None
     frame: str | None = None
@@ -127,10 +127,11 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
     replays = _replays(request) if source.joint_names else {}
     for each in replays.values():
         check_request(each)
-    inputs = {"sha256": digests, "versions": deciding_versions(), "options": repr(request.options)}
+    options = repr((request.options, request.base, request.locked))
+    inputs = {"sha256": digests, "versions": deciding_versions(), "options": options}
     steps = _Steps(folder=request.out, inputs=inputs, done=_open_folder(request), progress=progress)
     if urdf is not None and lacks_spheres:
-        steps.make("spheres", SPHERES, partial(_fit, urdf, request.out / SPHERES))
+        steps.make("spheres", SPHERES, partial(_fit, urdf, request))
     steps.make("check", CHECK, partial(_check, request))
     config, seed = request.config.as_dict(), request.seed
     of_map = {name: config[name] for name in config if name not in OF_REPLAYS}
@@ -167,7 +168,7 @@ def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
     found["robot"] = hashlib.sha256(urdf.text.encode()).hexdigest()
     for mesh in (*urdf.meshes, *visual_urdf(urdf).meshes):
         with suppress(InputError):
-            found[mesh.filename] = sha256(mesh_path(urdf.path, mesh))
+            found[mesh.filename] = sha256(mesh_path(urdf.path, mesh, request.packages))
     return found
 
 
@@ -176,8 +177,7 @@ def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
     logged = ReplayRequest(
         log=request.log,
         options=request.options,
-        urdf=request.urdf,
-        spheres=request.spheres,
+        **_robot(request),
         scene=request.out / SCENE,
         out=request.out / LOGGED,
         config=request.config,
@@ -198,6 +198,10 @@ def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
         out=request.out / DRIVEN,
     )
     return {LOGGED: logged, DRIVEN: driven}
+
+
+def _robot(request: AuditRequest) -> dict[str, Any]:
+    return {name: getattr(request, name) for name in ("urdf", *(each.name for each in fields(RobotOptions)))}
 
 
 def _words(request: AuditRequest, folder: str) -> list[str]:
@@ -231,17 +235,15 @@ def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
     return read_object(file)
 
 
-def _fit(urdf: UrdfFile, file: Path) -> None:
-    solids = read_solids(urdf)
+def _fit(urdf: UrdfFile, request: AuditRequest) -> None:
+    solids = read_solids(urdf, request.packages)
     fitted = fit_spheres(solids, FitOptions(max_spheres=max(DEFAULT_SPHERES, len(solids))))
     text = spheres_yaml(fitted, [f"Collision spheres for {urdf.path.name}, fitted by: splatctrl audit."])
-    write_durably(file, lambda partial: partial.write_text(text, encoding="utf-8"))
+    write_durably(request.out / SPHERES, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
 def _check(request: AuditRequest) -> None:
-    report, verdict = check(
-        CheckRequest(paths=(request.log,), options=request.options, urdf=request.urdf, spheres=request.spheres)
-    )
+    report, verdict = check(CheckRequest(paths=(request.log,), options=request.options, **_robot(request)))
     document = {"verdict": verdict.as_dict(), **report.as_dict()}
     write_durably(request.out / CHECK, lambda partial: write_json(partial, document))
 
@@ -251,8 +253,7 @@ def _reconstruct(request: AuditRequest, progress: Progress) -> None:
         ReconstructRequest(
             source=open_to_train(RecordingRequest(path=request.log, options=request.options)),
             recording=request.log,
-            urdf=request.urdf,
-            spheres=request.spheres,
+            **_robot(request),
             out=request.out / SCENE,
             config=request.config,
             seed=request.seed,
@@ -260,7 +261,7 @@ def _reconstruct(request: AuditRequest, progress: Progress) -> None:
             device=request.device,
             force=True,
             resume=request.resume,
-            options={"input": repr(request.options)},
+            options={"input": repr((request.options, request.base, request.locked))},
         ),
         progress,
     )

@@ -11,6 +11,10 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.scene.scene_folder import open_scene
+from splatctrl_cli.formats.splat.splats import read_ply
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.recording.source import open_source
+from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Label, RgbdFrame
 from splatctrl_cli.scene.recording_consistency import CAUSES
 from tests.cli.here import splatctrl
@@ -35,6 +39,35 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("unchecked")
+def test_a_robot_at_a_base_makes_the_map_of_one_at_the_origin_moved_there(
+    small_recording: Path, tmp_path: Path
+) -> None:
+    """The same images by cameras turned and moved with the robot, by half a metre and a right angle."""
+    T = np.eye(4)
+    T[:3] = [[0, -1, 0, 0.5], [1, 0, 0, -0.3], [0, 0, 1, 0.8]]
+    frames = open_source(small_recording / "log.mcap", SourceOptions(cameras=("cam0", "cam1"))).records()
+    poses = {each.camera: T @ each.T_world_camera for each in frames if isinstance(each, RgbdFrame)}
+    numbers = {
+        name: ",".join(f"{value:.17g}" for value in [*pose[:3, 3], *quat_from_rotation(pose[:3, :3])])
+        for name, pose in poses.items()
+    }
+    moved = [word for name in numbers for word in ("--camera-pose", f"{name}={numbers[name]}")]
+    base = ",".join(f"{value:.17g}" for value in [*T[:3, 3], *quat_from_rotation(T[:3, :3])])
+    assert reconstruct(small_recording, tmp_path / "origin") == 0
+    assert reconstruct(small_recording, tmp_path / "moved", f"--base={base}", *moved) == 0
+    here, there = (open_scene(tmp_path / name).run["metrics"] for name in ("origin", "moved"))
+    assert there["self_mask_residual_mm"] == pytest.approx(here["self_mask_residual_mm"], abs=0.1)
+    assert there["robot_splats"] == pytest.approx(here["robot_splats"], rel=0.25)
+    assert there["psnr"] == pytest.approx(here["psnr"], abs=0.5)
+    scene = read_ply(tmp_path / "moved" / "splats.ply")[0].centers
+    expected = read_ply(tmp_path / "origin" / "splats.ply")[0].centers @ T[:3, :3].T + T[:3, 3]
+    distance = np.linalg.norm(scene[:, None] - expected[None], axis=2).min(axis=1)
+    assert np.median(distance) < 0.04  # of 800 splats, drawn anew
+    assert reconstruct(small_recording, tmp_path / "astray", *moved) == 0
+    reasons = open_scene(tmp_path / "astray").run["verdict"]["reasons"]
+    assert "no camera sees the robot where its joints put it" in {reason["sentence"] for reason in reasons}
+
+
 def test_one_thread_and_two_give_the_same_bytes(small_recording: Path, tmp_path: Path) -> None:
     for name, threads in (("one", "1"), ("two", "2")):
         assert reconstruct(small_recording, tmp_path / name, "--threads", threads) == 0

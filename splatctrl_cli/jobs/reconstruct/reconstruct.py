@@ -168,16 +168,16 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         remedy="write poses and depth in metres, or leave the robot out",
     )
     try:
-        model = RobotModel.from_urdf(urdf, request.spheres)
+        model = request.posed(urdf)
         if request.source.joint_names:
             model = model.moved_by(request.source.joint_names)
             model.joint_columns(request.source.joint_names)
         model = add_self_model(model, request.self_model)
         if request.urdf is None:
             refuse_if(
-                words := other_frame(urdf, request.source),
+                words := other_frame(urdf, request.source) if request.base is None else "",
                 f"{urdf.path}: {words}",
-                remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one",
+                remedy=f"give --world-frame {urdf.root}, or --base with its pose",
             )
             _check_has_states(request.source)
             progress.log(f"the robot is the log's own: {urdf.path}")

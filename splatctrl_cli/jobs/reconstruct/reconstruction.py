@@ -21,6 +21,7 @@ from splatctrl_cli.jobs.reconstruct.kept_maps import KeptMaps
 from splatctrl_cli.jobs.reconstruct.verdict import Reconstructed
 from splatctrl_cli.jobs.recordings.open_recording import CameraAgreement, guessed_unit
 from splatctrl_cli.jobs.recordings.provenance import first_frame
+from splatctrl_cli.jobs.robot.logged_robot import RobotOptions
 from splatctrl_cli.jobs.running.device import CPU, Device, FitDevice, RunOptions
 from splatctrl_cli.jobs.running.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
@@ -50,10 +51,10 @@ def training_cameras(source: RecordSource) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructRequest(RunOptions):
+class ReconstructRequest(RobotOptions, RunOptions):
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, segmented from the splats (None: the log `recording`'s); its reach is the workspace
+    urdf: the robot, segmented from the splats (None: the log `recording`'s); its reach is the workspace
     without `box`. points: a coloured cloud to start from. declare: a TOML of carried objects. corrections: of a still
     scene's views. options: the rest that decides the bytes, which a resumed run must share.
     """
@@ -62,7 +63,6 @@ class ReconstructRequest(RunOptions):
     out: Path = Path("scene")
     recording: Path | None = None
     urdf: Path | None = None
-    spheres: Path | None = None
     self_model: Path | None = None
     box: Box | None = None
     points: Path | None = None

@@ -179,6 +179,12 @@ def _calibration(made: Reconstructed) -> Iterator[Reason]:
     yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
     medians = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
     if not medians:
+        if made.metrics.get("robot_links") and not made.metrics["self_mask"] and not made.is_seeded:
+            yield note(
+                criterion="calibration",
+                sentence="no camera sees the robot where its joints put it",
+                remedy="give the pose of its root with --base, or make its root the world with --world-frame",
+            )
         return
     link = max(medians, key=lambda name: abs(medians[name]))
     median, allowed = medians[link], 1e3 * made.config.occupancy.self_mask_tolerance

@@ -174,6 +174,8 @@ DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's byt
     **{
         "pairing_tolerance": 0.02,
         "joint_topic": None,
+        "base": None,
+        "lock": [],
         "holdout": None,
         "scan": None,
         "box": None,

@@ -206,7 +206,7 @@ def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path)
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
     assert _robot(request, Said()).sphere_set.links == ("tip",)
     other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
-    with pytest.raises(InputError, match=r"give --world-frame base, or --urdf where both frames are one"):
+    with pytest.raises(InputError, match=r"give --world-frame base, or --base with its pose"):
         _robot(replace(request, source=open_source(other), recording=other), Said())
 
 
