@@ -66,8 +66,8 @@ def refuse_faults(
     try:
         yield
     except faults as fault:
-        said = f"{what}: {fault}" if isinstance(what, str) else what(fault)
-        raise (error(said, remedy=remedy) if remedy else error(said)) from None
+        message = f"{what}: {fault}" if isinstance(what, str) else what(fault)
+        raise (error(message, remedy=remedy) if remedy else error(message)) from None
 
 
 class NotEvaluableError(SplatCtrlError):

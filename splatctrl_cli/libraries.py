@@ -53,6 +53,6 @@ Entry = TypeVar("Entry")  # of a registry; lists and trials start with the lowes
 
 def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
     """Entries of type `kind` in the ``ENTRIES`` of a room's modules, in order."""
-    modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
-    found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
-    return tuple(sorted(found, key=attrgetter("order")))
+    modules = [import_module(f"{room}.{entries.name}") for entries in iter_modules(import_module(room).__path__)]
+    entries = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
+    return tuple(sorted(entries, key=attrgetter("order")))

@@ -279,8 +279,8 @@ def _best_scale(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], ca
     more = shares[plain] + limits.VIEWS_MORE_FIT, limits.VIEWS_TIMES_FIT * shares[plain]
     if shares[best] < max(*more, limits.VIEWS_LEAST_FIT):
         return None
-    beside = [_fitting(views, pairs, cameras, tried[best] * factor) for factor in limits.VIEWS_BESIDE]
-    least = min(num_fit / max(num, 1) for num_fit, num in beside if num > limits.VIEWS_LANDED // 10)
+    neighbours = [_fitting(views, pairs, cameras, tried[best] * factor) for factor in limits.VIEWS_BESIDE]
+    least = min(num_fit / max(num, 1) for num_fit, num in neighbours if num > limits.VIEWS_LANDED // 10)
     if least > limits.VIEWS_SAME_FIT * fit[best]:
         return None  # a flat wall fits at any scale
     near = [tried[best] * factor for factor in FINE]

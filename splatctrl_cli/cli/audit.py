@@ -11,8 +11,8 @@ OWN = ("log", "urdf", "robot", "spheres", "goal", "goal-joints", "frame")  # all
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    given = OfThisProgram(threads=0).options_of(["audit", *args.parser._words])
-    shared = {find_action(args.parser, "audit", name): value for name, value in given.items() if name not in OWN}
+    options = OfThisProgram(threads=0).options_of(["audit", *args.parser._words])
+    shared = {find_action(args.parser, "audit", name): value for name, value in options.items() if name not in OWN}
     words = [word for action, value in shared.items() for word in words_of("audit", action, value, Path())]
     result = audit(request_of(AuditRequest, args, words=tuple(words)), console)
     return console.show(result, [f"page: {result.document['page']}"], has_findings=True)

@@ -68,10 +68,10 @@ class OfThisProgram:
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
         """Words for options by long name, and files among them. Raises UsageError for unknown ones."""
         parser, places, words = _parser_of(command), list[str](), [command]
-        given = {"threads": self.threads, **options}
-        known = [name for name in given if name not in OWN or f"--{name}" in parser._option_string_actions]
+        values_by_name = {"threads": self.threads, **options}
+        known = [name for name in values_by_name if name not in OWN or f"--{name}" in parser._option_string_actions]
         for name, action in {name: find_action(parser, command, name) for name in known}.items():
-            made = words_of(name, action, given[name], folder)
+            made = words_of(name, action, values_by_name[name], folder)
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
         words += ["--json", *(["--", *places] if places else [])]
@@ -79,21 +79,21 @@ class OfThisProgram:
         if hasattr(parsed, "set"):
             load_config(parsed.config, parsed.set)
         values = [value for name, value in vars(parsed).items() if name != "out"]
-        found = [each for value in values for each in (value if isinstance(value, list) else [value])]
-        return tuple(words), tuple(path for path in found if isinstance(path, Path))
+        flat = [each for value in values for each in (value if isinstance(value, list) else [value])]
+        return tuple(words), tuple(path for path in flat if isinstance(path, Path))
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
         parser = _parser_of(words[0])
-        found, given = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
+        options, parsed_values = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
         for action in parser._actions:
             name = max(action.option_strings, key=len, default=action.dest).removeprefix("--")
-            value = given.get(action.dest)
+            value = parsed_values.get(action.dest)
             if name in NOT_OF_A_NODE or value is None or value == action.default:
                 continue
             if name in TABLES:
                 value = dict(text.partition("=")[::2] for text in value)
-            found[name] = list(value) if isinstance(value, tuple) else value
-        return found
+            options[name] = list(value) if isinstance(value, tuple) else value
+        return options
 
 
 def run_words(words: list[str]) -> int:

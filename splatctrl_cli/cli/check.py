@@ -50,11 +50,11 @@ def _lines(report: CheckReport) -> Iterator[str]:
 def _needs(report: CheckReport) -> Iterator[str]:
     if ready := [command for command in report.lacks if not report.obstacles(command)]:
         yield f"can start: {', '.join(ready)}"
-    kept: dict[str, list[str]] = {}
+    needs: dict[str, list[str]] = {}
     for command in report.lacks:
         if codes := dict.fromkeys(finding.code for finding in report.blockers(command)):
-            kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(command)
-    yield from (f"cannot start, or would be wrong: {', '.join(names)}; see {why}" for why, names in kept.items())
+            needs.setdefault(", ".join(f"[{code}]" for code in codes), []).append(command)
+    yield from (f"cannot start, or would be wrong: {', '.join(names)}; see {why}" for why, names in needs.items())
     for command, lack in report.lacks.items():
         yield from textwrap.wrap(f"missing for {command}: {lack}", WIDTH, subsequent_indent="  ") if lack else ()
 

@@ -27,31 +27,33 @@ BOX = "X0,Y0,Z0,X1,Y1,Z1"
 SEVERAL_LOGS = "several logs of one session are read as one"
 
 
-def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
+def request_of(kind: type[T], args: argparse.Namespace, **fields_given: Any) -> T:
     """Build a request, its configuration and nested options: `given` fields, else options, else defaults.
 
     Raises UsageError for a wrong value.
     """
     all_fields = fields(kind)  # type: ignore[arg-type]
-    left: dict[str, Any] = {field.name: field.default_factory for field in all_fields if field.name not in given}
-    found = dict(given)
+    left: dict[str, Any] = {
+        field.name: field.default_factory for field in all_fields if field.name not in fields_given
+    }
+    values = dict(fields_given)
     for action in args.parser._actions:
         value = getattr(args, action.dest, None)
         for name, read in action.fields.items():
             if name in left and value is not None:
-                found[name] = (resolve_name(f"splatctrl_cli.{read}") if isinstance(read, str) else read)(value)
+                values[name] = (resolve_name(f"splatctrl_cli.{read}") if isinstance(read, str) else read)(value)
     for name, made_by in left.items():
         if made_by is Config:
-            found[name] = config_of(args)
+            values[name] = config_of(args)
         elif isinstance(made_by, type) and is_dataclass(made_by):
-            found[name] = request_of(made_by, args)
-    return kind(**found)
+            values[name] = request_of(made_by, args)
+    return kind(**values)
 
 
 def config_of(args: argparse.Namespace) -> Config:
     """Read the configuration: --config and --set, then options that set one key."""
-    given = {action.sets: getattr(args, action.dest) for action in args.parser._actions if action.sets}
-    ours = [f"{key}={value}" for key, value in given.items() if value is not None]
+    overrides = {action.sets: getattr(args, action.dest) for action in args.parser._actions if action.sets}
+    ours = [f"{key}={value}" for key, value in overrides.items() if value is not None]
     return load_config(args.config, [*args.set, *ours])
 
 

@@ -44,10 +44,13 @@ def _lines(result: Result) -> Iterator[str]:
     left_out = f", {metrics['num_left_out']} left out by label" if metrics["num_left_out"] else ""
     yield "{}: {num_splats} splats{}, {bytes} bytes, {format}".format(result.out, left_out, **metrics)
     yield from result.notes
-    found, allowed = metrics["differences"], metrics["allowed"]
+    differences, allowed = metrics["differences"], metrics["allowed"]
     yield from table(
         ["largest difference", "found", "allowed"],
-        [(name, f"{found[key] * unit:.3g}", f"{allowed[key] * unit:.3g}") for key, (name, unit) in SHOWN.items()],
+        [
+            (name, f"{differences[key] * unit:.3g}", f"{allowed[key] * unit:.3g}")
+            for key, (name, unit) in SHOWN.items()
+        ],
     )
     yield (
         f"read back and rendered from {metrics['num_views_compared']} views ({100 * metrics['covered_share']:.0f} % "

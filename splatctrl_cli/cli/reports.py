@@ -31,8 +31,8 @@ def report_command(args: argparse.Namespace, verdict: Mapping[str, Any] | None, 
     """
     action = getattr(args, "action", None)
     command = f"{args.command} {action}" if action else args.command
-    given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
-    path = " ".join(map(str, given if isinstance(given, list) else [given]))
+    recording = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
+    path = " ".join(map(str, recording if isinstance(recording, list) else [recording]))
     seconds = time.perf_counter() - args.began
     group = f"{path}/{command}" if path else command
     properties = {"splatctrl": __version__, "command": command, "exit code": str(code)}

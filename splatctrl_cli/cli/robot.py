@@ -36,14 +36,13 @@ def run_check(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_pairs(args: argparse.Namespace, console: Console) -> int:
-    found, document = robot_pairs(request_of(RobotRequest, args))
-    ordered = sorted(found.link_pairs, key=lambda pair: pair.left_out is not None)
+    pairs, document = robot_pairs(request_of(RobotRequest, args))
+    ordered = sorted(pairs.link_pairs, key=lambda pair: pair.left_out is not None)
     rows = [(*pair.links, pair.num_sphere_pairs, *_gap(pair), pair.left_out or "") for pair in ordered]
-    kept = len(found.link_pairs) - len(found.left_out)
-    sampled = f", gaps over {found.num_postures} postures" if found.num_postures else ""
-    summary = (
-        f"{len(found.pairs)} pairs of spheres on {kept} pairs of links are checked, {len(found.left_out)} left out"
-    )
+    num_pairs = len(pairs.link_pairs) - len(pairs.left_out)
+    sampled = f", gaps over {pairs.num_postures} postures" if pairs.num_postures else ""
+    num_left = len(pairs.left_out)
+    summary = f"{len(pairs.pairs)} pairs of spheres on {num_pairs} pairs of links are checked, {num_left} left out"
     foreign, of_srdf = document["num_foreign_pairs"], args.srdf and args.srdf.name
     lines = [
         *table(("link", "and", "sphere pairs", "gap mm", "touch %", "left out because"), rows),

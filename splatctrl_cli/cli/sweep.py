@@ -54,5 +54,7 @@ def _least(result: SweepResult) -> list[str]:
         return ["all together: no flip in any direction tried"]
     first = result.least.first
     values = ", ".join(f"{name}={value:.6g}" for name, value in first.values.items())
-    found = f"least change of all together: {values}: {first.label.upper()}, {result.least.length:.3f} of the ranges"
-    return [found, f"  {first.sentence}"]
+    summary = (
+        f"least change of all together: {values}: {first.label.upper()}, {result.least.length:.3f} of the ranges"
+    )
+    return [summary, f"  {first.sentence}"]

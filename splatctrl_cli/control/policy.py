@@ -169,16 +169,16 @@ class PolicyClient:
 
     def _observe(self, question: Document) -> Document:
         """The observation by key; a camera without an image yet is left out."""
-        images, found = self._images.at(question["stamp_ns"]), dict[str, Any]()
+        images, observation = self._images.at(question["stamp_ns"]), dict[str, Any]()
         for key, value in self._observed.items():
             camera = value.removeprefix(IMAGE)
             if value == JOINTS:
-                found[key] = np.array(question["q"], np.float32)
+                observation[key] = np.array(question["q"], np.float32)
             elif camera == value:
-                found[key] = value
+                observation[key] = value
             elif camera in images:
-                found[key] = images[camera]
-        return found
+                observation[key] = images[camera]
+        return observation
 
     def _exchange(self, observation: bytes, limit: float) -> Document:
         try:

@@ -164,11 +164,11 @@ class Approach:
 
     def speed_scale(self, motion: ArmMotion, room: Float64) -> Float64:
         """Largest scales (T,) at which no sphere travels more than its room (T, M) [m]; else 0."""
-        kept = np.zeros(len(room))
+        scale = np.zeros(len(room))
         for step in (1.0, *(0.5**k for k in range(1, SCALE_STEPS + 1))):
-            tried = np.minimum(kept + step, 1.0)
-            kept = np.where(np.all(self.travel(motion, tried).total <= room, axis=1), tried, kept)
-        return kept
+            tried = np.minimum(scale + step, 1.0)
+            scale = np.where(np.all(self.travel(motion, tried).total <= room, axis=1), tried, scale)
+        return scale
 
     def time_to_contact(self, motion: ArmMotion, separation: Float64) -> Float64:
         """Least time (T,) [s] in which person and arm, at their speeds, close a separation (T, M) [m]."""

@@ -43,8 +43,8 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
 
     Raises UsageError for other names or duplicates.
     """
-    found = [re.search(r"(?:^|_)joint([1-7])$", name) for name in joint_names]
-    numbers = [0 if match is None else int(match.group(1)) for match in found]
+    matches = [re.search(r"(?:^|_)joint([1-7])$", name) for name in joint_names]
+    numbers = [0 if match is None else int(match.group(1)) for match in matches]
     odd = [name for name, n in zip(joint_names, numbers, strict=True) if n == 0 or numbers.count(n) > 1]
     refuse_if(
         odd,
@@ -243,13 +243,13 @@ class MotionLimits:
         """(T, J) [1/s^2], less encoder error; 0 while the motion is too short."""
         seconds = (all_stamps - all_stamps[0]) * 1e-9
         now = (stamps - all_stamps[0]) * 1e-9
-        found = np.zeros((len(stamps), everything.shape[1]))
+        accelerations = np.zeros((len(stamps), everything.shape[1]))
         old = now >= 2 * fixed.MOTION_WINDOW
         for joint in range(everything.shape[1]):
             at = [np.interp(now[old] - k * fixed.MOTION_WINDOW, seconds, everything[:, joint]) for k in range(3)]
             second = np.abs(at[0] - 2 * at[1] + at[2]) - 4 * fixed.ENCODER
-            found[old, joint] = np.maximum(second, 0.0) / fixed.MOTION_WINDOW**2
-        return found
+            accelerations[old, joint] = np.maximum(second, 0.0) / fixed.MOTION_WINDOW**2
+        return accelerations
 
 
 Cost = tuple[Float64, Float64]

@@ -119,18 +119,18 @@ def serve(target: str) -> None:
     controller = class_named(target)(ControllerStart.of(line()))
     answer(protocol=PROTOCOL)
     while True:
-        asked = line()
+        question = line()
         known: list[Sequence[ClearanceRow]] = []
 
-        def rows(number: int = asked["id"], known: list[Sequence[ClearanceRow]] = known) -> Sequence[ClearanceRow]:
+        def rows(number: int = question["id"], known: list[Sequence[ClearanceRow]] = known) -> Sequence[ClearanceRow]:
             if not known:
                 answer(id=number, ask="rows")
                 known.append([ClearanceRow(**{**row, "G": _array(row["G"])}) for row in line()["rows"]])
             return known[0]
 
-        arrays = {name: _array(asked[name]) for name in ARRAYS}
-        now = ControllerInput(stamp_ns=asked["stamp_ns"], rows=rows, **arrays)
-        answer(id=asked["id"], velocity=_velocities(target, controller.step(now)))
+        arrays = {name: _array(question[name]) for name in ARRAYS}
+        now = ControllerInput(stamp_ns=question["stamp_ns"], rows=rows, **arrays)
+        answer(id=question["id"], velocity=_velocities(target, controller.step(now)))
 
 
 def class_named(target: str) -> Callable[[ControllerStart], Controller]:
@@ -143,10 +143,10 @@ def class_named(target: str) -> Callable[[ControllerStart], Controller]:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         sys.exit(f"no module {error.name} in {Path.cwd()} nor installed")
-    made: Callable[[ControllerStart], Controller] | None = getattr(module, name, None)
-    if not callable(made):
+    factory: Callable[[ControllerStart], Controller] | None = getattr(module, name, None)
+    if not callable(factory):
         sys.exit(f"module {module_name} ({module.__file__}) has no class {name}")
-    return made
+    return factory
 
 
 def _array(values: Sequence[Any] | None) -> Any:

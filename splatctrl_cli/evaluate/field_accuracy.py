@@ -53,7 +53,7 @@ OVER_SCALES = {
 
 def figures_of(document: Mapping[str, Any]) -> dict[str, float | None]:
     """The numbers of an accuracy, as in ``field.json``, by the names of `metric_scales`."""
-    found = {
+    figures = {
         f"{where}.{name}.{band_name(band['lower'], band['upper'])}.{figure}": value
         for where in ("everywhere", "seen")
         for name, bands in document[where].items()
@@ -61,7 +61,7 @@ def figures_of(document: Mapping[str, Any]) -> dict[str, float | None]:
         for figure, value in band.items()
         if figure not in {"lower", "upper"}
     }
-    return found | {f"over_estimate.{name}": value for name, value in document["over_estimate"].items()}
+    return figures | {f"over_estimate.{name}": value for name, value in document["over_estimate"].items()}
 
 
 def metric_scales(field_names: Sequence[str]) -> dict[str, Scale]:
@@ -124,18 +124,18 @@ def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     Without its channel, hard is ``bound`` plus the header's margin, within a micrometre. Raises InputError with
     neither.
     """
-    found: dict[str, GridDistance] = {
+    distances: dict[str, GridDistance] = {
         name: (grid.channels[name], 0.0) for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels
     }
-    if "hard" not in found:
+    if "hard" not in distances:
         margin = grid.header.get("bound_margin")
         if "bound" not in grid.channels or not isinstance(margin, int | float):
             raise InputError(
                 f"distance grid: expected a channel hard or bound, got {', '.join(grid.channels)}",
                 remedy="bake with the channel bound, which is there by default",
             )
-        found["hard"] = grid.channels["bound"], float(margin)
-    return found
+        distances["hard"] = grid.channels["bound"], float(margin)
+    return distances
 
 
 def median_radius(grid: DistanceGrid) -> float:

@@ -66,11 +66,11 @@ def cloud_score(
         error=NotEvaluableError,
     )
     of = {"accuracy": to_reference, "completeness": to_surface, "completeness_seen": to_surface[seen]}
-    found = {name: _mean_below(distances, max_distance) for name, distances in of.items()}
+    scores = {name: _mean_below(distances, max_distance) for name, distances in of.items()}
     return {
-        **{name: mean for name, (mean, _) in found.items()},
-        "chamfer": (found["accuracy"][0] + found["completeness"][0]) / 2,
-        **{f"{name}_beyond": beyond for name, (_, beyond) in found.items()},
+        **{name: mean for name, (mean, _) in scores.items()},
+        "chamfer": (scores["accuracy"][0] + scores["completeness"][0]) / 2,
+        **{f"{name}_beyond": beyond for name, (_, beyond) in scores.items()},
         "num_points": float(len(counted)),
         "num_reference": float(len(reference)),
     }
@@ -123,16 +123,16 @@ def space_out(points: Float64, spacing: float) -> Float64:
     low, high = (
         cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else np.empty((0, 2), np.int64)
     ).T
-    is_open, kept = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
+    is_open, chosen = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
     while is_open.any():  # points without an earlier open neighbour stay, their neighbours go: as if in turn
         first = is_open.copy()
         first[high] = False
-        kept |= first
+        chosen |= first
         is_open &= ~first
         is_open[high[first[low]]] = False
         waits = is_open[low] & is_open[high]
         low, high = low[waits], high[waits]
-    return some[kept]
+    return some[chosen]
 
 
 def thin(points: Float64, spacing: float) -> Float64:
@@ -313,8 +313,10 @@ def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame])
     is_free = np.ones(len(points), dtype=np.bool_)
     for share in fixed.FREE_PROBES:
         for direction in directions:
-            asked = np.flatnonzero(is_free)
-            is_free[asked] = _find_seen_free(points[asked] + share * radius[asked, None] * direction, frames)
+            candidates = np.flatnonzero(is_free)
+            is_free[candidates] = _find_seen_free(
+                points[candidates] + share * radius[candidates, None] * direction, frames
+            )
     return is_free
 
 
@@ -322,7 +324,7 @@ def _find_seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
     """(Q,) True before, or just behind, measured depth."""
     is_free = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
-        asked = np.flatnonzero(~is_free)
-        landing, own, measured = measured_along(points_world[asked], frame)
-        is_free[asked[landing]] = (measured > 0) & (own <= measured + fixed.FREE_TOLERANCE)
+        rest = np.flatnonzero(~is_free)
+        landing, own, measured = measured_along(points_world[rest], frame)
+        is_free[rest[landing]] = (measured > 0) & (own <= measured + fixed.FREE_TOLERANCE)
     return is_free

@@ -149,9 +149,9 @@ def clearance_agreement(
         return dict.fromkeys(FIGURES) | {"num_compared": 0, "tolerance": tolerance}
     size = np.abs(error)
     over, share = max(error.max(), 0.0), np.mean(size <= tolerance)
-    found = (len(error), np.median(size), np.percentile(size, 95), size.max(), over, tolerance, share)
+    figures = (len(error), np.median(size), np.percentile(size, 95), size.max(), over, tolerance, share)
     return {
-        name: value if name == "num_compared" else float(value) for name, value in zip(FIGURES, found, strict=True)
+        name: value if name == "num_compared" else float(value) for name, value in zip(FIGURES, figures, strict=True)
     }
 
 
@@ -164,6 +164,6 @@ def mark_seen(
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)
-        asked = first + np.flatnonzero(~seen[part] & ((stamp_ns[part] >= frame.stamp_ns) | (not has_clock)))
-        if len(asked):
-            seen[asked] = seen_by(points_world[asked], [frame])
+        candidates = first + np.flatnonzero(~seen[part] & ((stamp_ns[part] >= frame.stamp_ns) | (not has_clock)))
+        if len(candidates):
+            seen[candidates] = seen_by(points_world[candidates], [frame])

@@ -108,14 +108,14 @@ def score_view(
         region = pixels & valid
         errors = depth_errors(depth, frame.depth, region)
         num_reference = int(np.count_nonzero(region & (frame.depth > 0)))
-        found = {
+        scores = {
             "psnr": psnr(rendered, photo, region),
             "ssim": float(similarity[region].mean()) if region.any() else math.nan,
             **errors,
             "depth_coverage": errors["depth_pixels"] / num_reference if num_reference else math.nan,
             "in_front": share_in_front(depth, frame.depth, region),
         }
-        figures |= {f"{figure}_{name}": value for figure, value in found.items()}
+        figures |= {f"{figure}_{name}": value for figure, value in scores.items()}
     return figures
 
 

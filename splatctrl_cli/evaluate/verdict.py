@@ -125,8 +125,8 @@ class Verdict:
         """`exit_code` by criteria that begin with one of `criteria` (None: all)."""
         if criteria is None:
             return self.exit_code
-        asked = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
-        return EXIT_CODES[min(asked, key=_WORST_FIRST.index, default=Outcome.PASSED)]
+        outcomes = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
+        return EXIT_CODES[min(outcomes, key=_WORST_FIRST.index, default=Outcome.PASSED)]
 
     @property
     def decisive(self) -> tuple[Reason, ...]:
@@ -179,8 +179,8 @@ def verdict_of(
 
     Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
-    given = list(reasons) or [lacking(criterion="evidence", sentence="nothing was judged")]
-    ordered = sorted(given, key=lambda reason: _WORST_FIRST.index(reason.outcome))
+    all_reasons = list(reasons) or [lacking(criterion="evidence", sentence="nothing was judged")]
+    ordered = sorted(all_reasons, key=lambda reason: _WORST_FIRST.index(reason.outcome))
     outcome = ordered[0].outcome
     failure = next((r.label for r in ordered if r.outcome is Outcome.FAILED and r.label), "failed")
     return Verdict(

@@ -46,8 +46,8 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
     Each is the least within 0.5 s on either side. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
-    beside = np.concatenate([[np.inf], values, [np.inf]])
-    lowest = np.flatnonzero((values < beside[:-2]) & (values <= beside[2:]) & np.isfinite(values))
+    padded = np.concatenate([[np.inf], values, [np.inf]])
+    lowest = np.flatnonzero((values < padded[:-2]) & (values <= padded[2:]) & np.isfinite(values))
     apart_ns = round(0.5 * 1e9)  # [s] between the moments of two events
     chosen: list[int] = []
     for index in lowest[np.argsort(values[lowest], kind="stable")]:
@@ -66,19 +66,19 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
     One pass over frames, by stamp.
     """
-    found: list[Sight | None] = [None] * len(moments)
+    sights: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
     newest: dict[str, RgbdFrame] = {}
     for frame in frames:
         while waiting and moments[waiting[-1]].stamp_ns < frame.stamp_ns:
             index = waiting.pop()
-            found[index] = _best(moments[index], newest)
+            sights[index] = _best(moments[index], newest)
         if not waiting:
-            return found
+            return sights
         newest[frame.camera] = frame
     for index in waiting:
-        found[index] = _best(moments[index], newest)
-    return found
+        sights[index] = _best(moments[index], newest)
+    return sights
 
 
 def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:

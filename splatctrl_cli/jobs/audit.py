@@ -162,14 +162,14 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
     """sha256 of the given spheres, and of the robot's text and meshes."""
-    found = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
+    digests = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
     if urdf is None:
-        return found
-    found["robot"] = hashlib.sha256(urdf.text.encode()).hexdigest()
+        return digests
+    digests["robot"] = hashlib.sha256(urdf.text.encode()).hexdigest()
     for mesh in (*urdf.meshes, *visual_urdf(urdf).meshes):
         with suppress(InputError):
-            found[mesh.filename] = sha256(mesh_path(urdf.path, mesh, request.packages))
-    return found
+            digests[mesh.filename] = sha256(mesh_path(urdf.path, mesh, request.packages))
+    return digests
 
 
 def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
@@ -206,15 +206,17 @@ def _robot(request: AuditRequest) -> dict[str, Any]:
 
 def _words(request: AuditRequest, folder: str) -> list[str]:
     robot = {"--urdf": request.urdf, "--spheres": request.spheres}
-    given = [word for name, path in robot.items() if path is not None for word in (name, str(path))]
-    return [str(request.log), *given, "-o", str(request.out / folder), *request.words]
+    robot_words = [word for name, path in robot.items() if path is not None for word in (name, str(path))]
+    return [str(request.log), *robot_words, "-o", str(request.out / folder), *request.words]
 
 
 def _goal(request: ReplayRequest) -> list[str]:
     goals = {"--goal": request.goal, "--goal-joints": request.goal_joints}
-    given = [f"{name}={','.join(map(str, goal))}" for name, goal in goals.items() if goal is not None]
+    goal_words = [f"{name}={','.join(map(str, goal))}" for name, goal in goals.items() if goal is not None]
     frame = [] if request.frame is None else ["--frame", request.frame]
-    return ["--mode", request.mode, "--start-time", str(request.start_time), *given, *frame] if given else []
+    return (
+        ["--mode", request.mode, "--start-time", str(request.start_time), *goal_words, *frame] if goal_words else []
+    )
 
 
 def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
@@ -281,8 +283,8 @@ def _judge_map(request: AuditRequest) -> Verdict:
 def _write_page(request: AuditRequest, source: FrameSource, verdict: Verdict, folders: Sequence[str]) -> None:
     page, checked = request.out / PAGE, read_object(request.out / CHECK)
     rows = [
-        (tuple(found[name] for name in FINDING), "failed" if found["severity"] == "error" else "")
-        for found in checked["findings"]
+        (tuple(finding[name] for name in FINDING), "failed" if finding["severity"] == "error" else "")
+        for finding in checked["findings"]
     ]
     recording = Table(title=checked["verdict"]["sentence"], header=FINDING, rows=rows, is_folded=True)
     pairs = render_newest(open_scene(request.out / SCENE), source, request.threads)

@@ -246,12 +246,12 @@ def _choose_fixed(request: CalibrateRequest, cameras: Sequence[str], *, has_anch
 
 def _find_unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
     evidence = solution.adjustment.evidence
-    found = {}
+    missing = {}
     for camera in solution.adjustment.unknowns.poses:
         view = next((view for view in evidence.views if view.camera == camera), None)
         T = np.eye(4) if view is None else view.T_world_camera @ solution.estimate.corrections[camera]
-        found[camera] = unobserved(solution.certainty, camera, T, None if view is None else plane_of(view, T))
-    return found
+        missing[camera] = unobserved(solution.certainty, camera, T, None if view is None else plane_of(view, T))
+    return missing
 
 
 def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
@@ -284,7 +284,7 @@ def _calibration(
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         scale, bias = estimate.depth_of(camera)
         unknowns = solution.adjustment.unknowns
-        found = {"pose": unknowns.poses, "depth scale": unknowns.scales, "depth bias": unknowns.biases}
+        counts = {"pose": unknowns.poses, "depth scale": unknowns.scales, "depth bias": unknowns.biases}
         cameras[camera] = CalibratedCamera(
             T=T,
             recorded=None if moves else begun @ invert_transform(begin[camera]),
@@ -295,7 +295,7 @@ def _calibration(
             sigma_depth=certainty.sigma_depth(camera),
             depth_noticed=tuple(map(float, solution.noticed.get(camera, (np.inf, np.inf)))),
             covariance=covariance,
-            as_recorded=tuple(name for name, of_cameras in found.items() if camera not in of_cameras),
+            as_recorded=tuple(name for name, of_cameras in counts.items() if camera not in of_cameras),
             unobserved=unknown.get(camera, ()),
         )
     return Calibration(

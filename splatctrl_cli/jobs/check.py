@@ -149,7 +149,7 @@ def _verdict(report: CheckReport, fail_on: str) -> Verdict:
         threshold=1.0,
         count=report.num_messages,
     )
-    found = [
+    reasons = [
         Reason(
             criterion=finding.code,
             outcome=Outcome.FAILED if finding.severity in fatal else Outcome.PASSED,
@@ -166,7 +166,7 @@ def _verdict(report: CheckReport, fail_on: str) -> Verdict:
     counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
     return verdict_of(
         "check",
-        [read, *found],
+        [read, *reasons],
         scope=f"{Path(report.path).name}: {counts}",
         is_damaged=any(finding.code == "damaged" for finding in report.findings),
         counts={"messages": report.num_messages},

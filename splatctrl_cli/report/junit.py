@@ -109,8 +109,8 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
     """Cases not passed, with suites: failed, error, not evaluable, skipped."""
-    found = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
-    return sorted(found, key=lambda pair: WORST_FIRST.index(pair[1].kind))
+    cases = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
+    return sorted(cases, key=lambda pair: WORST_FIRST.index(pair[1].kind))
 
 
 def _case(name: str, group: str, reasons: Sequence[Mapping[str, Any]]) -> Case:
@@ -230,7 +230,7 @@ def _counts(suites: Sequence[Suite]) -> dict[str, str]:
 
 
 def _clean(text: str) -> str:
-    return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
+    return _NOT_XML.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 SUMMARY_BYTES = 1 << 20  # of a step, whoever wrote them; GitHub shows none of a larger one
@@ -289,8 +289,8 @@ def summary(suites: Sequence[Suite], room: int) -> str:
     if left < 0:
         return ""
     ends = itertools.accumulate(len(row.encode()) for row in rows)
-    kept = [row for row, end in zip(rows, ends, strict=True) if end <= left]
-    return head + "".join(kept) + MORE.format(len(rows) - len(kept))
+    shown_rows = [row for row, end in zip(rows, ends, strict=True) if end <= left]
+    return head + "".join(shown_rows) + MORE.format(len(rows) - len(shown_rows))
 
 
 def _cell(text: str) -> str:

@@ -109,8 +109,8 @@ def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
     if kind == BALL:
         return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
     if kind == CAPSULE:
-        made = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[SIDES, SIDES // 2])
-        return made.apply_translation([0.0, 0.0, -made.bounds.mean(axis=0)[2]])
+        capsule = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[SIDES, SIDES // 2])
+        return capsule.apply_translation([0.0, 0.0, -capsule.bounds.mean(axis=0)[2]])
     return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=SIDES)
 
 

@@ -148,9 +148,9 @@ def commands_picture(
             peak = _curve(axes, seconds, column(velocity, j), color=CURVE_COLORS[0], width=1.5)
             _limit_axis(axes, joint, float(limits[j]), peak, beneath)
             _tidy(axes, seconds)
-        beside = "" if logged is None else "; grey: as logged"
+        legend = "" if logged is None else "; grey: as logged"
         rows[0].set_title(
-            f"Commanded joint velocity [rad/s]; dashed: its limit, where it is in sight{beside}", pad=10
+            f"Commanded joint velocity [rad/s]; dashed: its limit, where it is in sight{legend}", pad=10
         )
         _draw_strip(strip, rows[-1], interventions, seconds)
         figure.align_ylabels(rows)

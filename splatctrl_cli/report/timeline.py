@@ -59,14 +59,14 @@ def timeline(
 
 def runs_of(rungs: Sequence[str], seconds: Float64) -> list[tuple[str, float, float]]:
     """Runs of equal rungs: rung, first time, next run's first time [s]."""
-    found, first = [], 0
+    runs, first = [], 0
     for rung, group in groupby(rungs):
         behind = first + len(list(group))
         end = seconds[behind] if behind < len(seconds) else seconds[-1]
         if rung:
-            found.append((rung, float(seconds[first]), float(end)))
+            runs.append((rung, float(seconds[first]), float(end)))
         first = behind
-    return found
+    return runs
 
 
 class _Axis:

@@ -128,14 +128,14 @@ def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> Lost
     is_object &= ~is_mixed(frame.depth, is_object, tolerance_at(frame.depth, config), 2, frame.intrinsics.fx)
     is_object = cv2.morphologyEx(is_object.view(np.uint8), cv2.MORPH_OPEN, BESIDE) > 0
     is_robot = (mask.kinds == PixelKind.ROBOT) | (mask.kinds == PixelKind.MIXED)
-    beside = cv2.erode(np.where(is_object, frame.depth, np.float32(np.inf)), BESIDE)
+    nearby = cv2.erode(np.where(is_object, frame.depth, np.float32(np.inf)), BESIDE)
     is_beside, is_outline = (
         cv2.dilate(pixels.view(np.uint8), reach) > 0
         for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
     )
     is_lost = (frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view
     v, u = np.divmod(np.flatnonzero(is_lost), frame.intrinsics.width)
-    depths = beside[v, u]
+    depths = nearby[v, u]
     places = transform_points(frame.T_world_camera, back_project_pixels(frame.intrinsics, u, v, depths))
     return LostEdges(centers=places.astype(np.float32), radii=depths / np.float32(frame.intrinsics.fx))
 

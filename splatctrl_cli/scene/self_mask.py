@@ -175,14 +175,14 @@ def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: Int16) -> Bool:
     return np.asarray((shown > 0) & (cv2.erode(shown, _window(1)) == 0))
 
 
-def _judge(kinds: UInt8, depth: Float32, beside: Bool, area: Float64, steps: Float32) -> None:
+def _judge(kinds: UInt8, depth: Float32, is_near: Bool, area: Float64, steps: Float32) -> None:
     """Mark object pixels near the robot that are too few to believe, in place.
 
     A piece joins neighbours that differ by less than both `steps` [m]. It is an object if it extends away from the
     robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.
     """
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
-    doubtful = is_object & beside
+    doubtful = is_object & is_near
     native.piece_areas(depth, steps, area, is_object.view(np.uint8), doubtful.view(np.uint8), shown)
     kinds[shown < fixed.MASK_ALONE] = PixelKind.DOUBTED
     kinds[shown < fixed.MASK_SPECK] = PixelKind.MIXED
@@ -224,13 +224,13 @@ def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64,
     Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
     object pixels become mixed.
     """
-    beside, masks = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
+    outvoted, masks = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
     for frame, mask in seen:
         reach = pixels_of(voxel, frame, mask.robot_depth)
-        beside.append(cv2.dilate((mask.kinds == PixelKind.ROBOT).view(np.uint8), _window(reach)))
+        outvoted.append(cv2.dilate((mask.kinds == PixelKind.ROBOT).view(np.uint8), _window(reach)))
     native.outvote(
         [camera_in_world(frame) for frame, _ in seen], [np.ascontiguousarray(frame.depth) for frame, _ in seen],
-        beside, [mask.kinds for mask in masks], origin, voxel, fixed.VOTE_SHARE,
+        outvoted, [mask.kinds for mask in masks], origin, voxel, fixed.VOTE_SHARE,
         PixelKind.ROBOT, PixelKind.OBJECT, PixelKind.MIXED,
     )  # fmt: skip
     return masks

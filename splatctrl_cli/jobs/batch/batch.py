@@ -202,20 +202,20 @@ def write_batch(
 
     Nodes not reached have the state "to do".
     """
-    found = list[Run]()
+    runs = list[Run]()
     for node in nodes:
         run = latest.get(node.name)
         if node.name in keys and (run is None or run.key != keys[node.name]):
             run = not_run(
                 node, "", out, state=TO_DO, cause="has not run since the suite, its inputs or the program changed"
             )
-        found += [] if run is None else [run]
+        runs += [] if run is None else [run]
     document = {
         "format": FORMAT,
         "version": FILE_VERSION,
         "suite": suite.name,
         "jobs": [job.name for job in suite.jobs],
-        "nodes": [run.document() for run in found],
+        "nodes": [run.document() for run in runs],
     }
     write_durably(out / FILE, lambda path: write_json(path, document))
 

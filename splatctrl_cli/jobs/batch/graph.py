@@ -75,8 +75,8 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
     nodes: list[Node] = []
     for recording in sorted(suite.recordings, key=lambda each: each.name):
         jobs = jobs_for(recording, suite.jobs, COMMANDS)
-        kept = {job.name: _add_roles(job, jobs, recording) for job in jobs}
-        nodes += _nodes_of(recording, _sort_jobs(kept, recording), suite.folder, out, command_line)
+        full_jobs = {job.name: _add_roles(job, jobs, recording) for job in jobs}
+        nodes += _nodes_of(recording, _sort_jobs(full_jobs, recording), suite.folder, out, command_line)
     return nodes
 
 
@@ -93,10 +93,10 @@ def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[
 
 
 def _add_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
-    given = {*job.options, *job.matrix}
-    given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
-    roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
-    if job.command in {"reconstruct", "score"} and "dtu" in given:
+    set_options = {*job.options, *job.matrix}
+    set_options |= {"field", "lockstep"} & set_options and {"scene"}  # either stands for its scene
+    roles = {option: role for option, role in ROLES[job.command].items() if option not in set_options}
+    if job.command in {"reconstruct", "score"} and "dtu" in set_options:
         roles = {option: role for option, role in roles.items() if option == "scene"}
     filled = {option: _fill(job, role, jobs, recording) for option, role in roles.items()}
     return replace(job, options={**filled, **job.options})
@@ -148,8 +148,8 @@ def _sort_jobs(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job,
 
 def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:
     texts = json.dumps([job.options, job.matrix], ensure_ascii=False, default=str)
-    found = dict.fromkeys(_PLACE.findall(texts))
-    for place in found:
+    needs = dict.fromkeys(_PLACE.findall(texts))
+    for place in needs:
         known = (RECORDING, NAME, *jobs)
         refuse_if(
             place not in known,
@@ -157,7 +157,7 @@ def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str
             remedy=f"known here: {', '.join(known)}",
             error=UsageError,
         )
-    return tuple(place for place in found if place in jobs)
+    return tuple(place for place in needs if place in jobs)
 
 
 def _nodes_of(
@@ -244,12 +244,12 @@ def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
         if f"{job.name}.{option}" in variant
     }
     count = Counter(option for option, _ in chosen.values())
-    found = ""
+    suffix = ""
     for key, value in variant.items():
         option, values = chosen[key]
         text = next(text for each, text in zip(values, _short(values), strict=True) if each is value)
-        found += f"+{option if count[option] == 1 else key}={text}"
-    return found
+        suffix += f"+{option if count[option] == 1 else key}={text}"
+    return suffix
 
 
 def _join(variants: Sequence[Variant]) -> Variant | None:

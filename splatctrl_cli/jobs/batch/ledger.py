@@ -189,8 +189,8 @@ class Ledger(AbstractContextManager["Ledger"]):
 
     def digest(self, path: Path) -> str:
         """sha256 of a file, or a folder's names and files; cached by sizes and times."""
-        key, found = str(path.resolve()), path.stat()
-        stamp = f"{found.st_size} {found.st_mtime_ns} {found.st_ino}"
+        key, status = str(path.resolve()), path.stat()
+        stamp = f"{status.st_size} {status.st_mtime_ns} {status.st_ino}"
         files = {place: place.stat() for place in sorted(path.rglob("*")) if place.is_file()}
         if path.is_dir():
             lines = [f"{place.relative_to(path)} {s.st_size} {s.st_mtime_ns}" for place, s in files.items()]
@@ -255,21 +255,21 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
 @cache
 def code_version() -> str:
     """Digest of the package's files and the versions that decide figures."""
-    folder, found = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
+    folder, sha = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
     for place in sorted(place for place in folder.rglob("*") if place.suffix in {".py", ".so", ".toml", ".json"}):
-        found.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
+        sha.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
     for name in PACKAGES:
-        found.update(f"{name} {metadata.version(name)}\0".encode())
-    return found.hexdigest()
+        sha.update(f"{name} {metadata.version(name)}\0".encode())
+    return sha.hexdigest()
 
 
 def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]:
     left_out = ("--force", "--resume", "--quiet", "-q", "--json")
     pairs = zip(words, ("", *words), strict=False)
-    kept = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
+    deciding = [w for w, before in pairs if w not in left_out and before != THREADS and not w.startswith(THREADS)]
     for path in sorted(named, key=len, reverse=True):
-        kept = [word.replace(path, f"<{named[path]}>") for word in kept]
-    return kept
+        deciding = [word.replace(path, f"<{named[path]}>") for word in deciding]
+    return deciding
 
 
 def _digest(path: Path, ledger: Ledger) -> str:

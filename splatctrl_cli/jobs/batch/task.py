@@ -126,8 +126,8 @@ def stamp_of(out: Path) -> str:
     """Size and time of an output's run.json, capture.json or file; empty without output."""
     for place in (out / "run.json", out / "capture.json", out):
         with contextlib.suppress(OSError):
-            found = place.stat()
-            return f"{found.st_size} {found.st_mtime_ns}" if place != out or not out.is_dir() else "folder"
+            status = place.stat()
+            return f"{status.st_size} {status.st_mtime_ns}" if place != out or not out.is_dir() else "folder"
     return ""
 
 

@@ -185,20 +185,20 @@ def _compare(before: JudgedRuns, after: JudgedRuns) -> CompareResult:
     pairs = [(old, after.runs[name]) for name, old in before.runs.items() if name in after.runs]
     only_before = tuple(sorted(before.runs.keys() - after.runs.keys()))
     verdicts = [change for old, new in pairs if (change := _verdict_change(old, new)) is not None]
-    found = [change for old, new in pairs for change in _figure_changes(old, new)]
-    jobs = sorted(_job_changes(found), key=lambda one: -one.worst.share)
+    changes = [change for old, new in pairs for change in _figure_changes(old, new)]
+    jobs = sorted(_job_changes(changes), key=lambda one: -one.worst.share)
     by_jobs = {(one.job, one.metric) for one in jobs}
-    worse = [one for one in found if one.change is Change.WORSE]
+    worse = [one for one in changes if one.change is Change.WORSE]
     alone = [one for one in worse if (one.job, one.metric) not in by_jobs or one.after is None]
     only_after = tuple(sorted(after.runs.keys() - before.runs.keys()))
     metrics = {
         "num_runs": len(pairs),
         "num_verdicts": sum(bool(old.outcome and new.outcome) for old, new in pairs),
-        "num_figures": sum(one.better is not Better.NEITHER for one in found),
+        "num_figures": sum(one.better is not Better.NEITHER for one in changes),
         "num_verdicts_worse": sum(one["change"] is Change.WORSE for one in verdicts),
         "num_verdicts_better": sum(one["change"] is Change.BETTER for one in verdicts),
         "num_worse": len(alone) + sum(one.change is Change.WORSE for one in jobs),
-        "num_better": sum(one.change is Change.BETTER for one in found),
+        "num_better": sum(one.change is Change.BETTER for one in changes),
     }
     num_figures, num_verdicts = metrics["num_figures"], metrics["num_verdicts"]
     counted = f"figures on both sides: {num_figures}, verdicts: {num_verdicts}, runs: {metrics['num_runs']}"
@@ -226,7 +226,7 @@ def _compare(before: JudgedRuns, after: JudgedRuns) -> CompareResult:
         verdicts=tuple(verdicts),
         figures=tuple(
             sorted(
-                (one for one in found if one.change is not Change.SAME),
+                (one for one in changes if one.change is not Change.SAME),
                 key=lambda one: (one.change is not Change.WORSE, -one.share, one.metric, one.run),
             )
         ),
@@ -285,10 +285,10 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
     return (Change.WORSE if harm > 0 else Change.BETTER), harm / allowed if allowed else math.copysign(math.inf, harm)
 
 
-def _job_changes(found: Sequence[FigureChange]) -> Iterator[JobChange]:
+def _job_changes(figure_changes: Sequence[FigureChange]) -> Iterator[JobChange]:
     """Changes of figures over enough recordings, worse or better by interval and mean."""
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
-    for one in found:
+    for one in figure_changes:
         if one.better is not Better.NEITHER and one.after is not None:
             by_job.setdefault((one.job, one.metric), []).append(one)
     for (job, metric), changes in by_job.items():
@@ -373,13 +373,13 @@ def _job_reason(one: JobChange) -> Reason:
 
 
 def _differences(pairs: Sequence[tuple[JudgedRun, JudgedRun]]) -> dict[str, tuple[str, str]]:
-    found: dict[str, tuple[str, str]] = {}
+    differing: dict[str, tuple[str, str]] = {}
     for old, new in pairs:
         for name, value in old.settings.items():
             values = str(value), str(new.settings.get(name, value))
             if values[0] != values[1]:
-                found.setdefault(name, values)
-    return found
+                differing.setdefault(name, values)
+    return differing
 
 
 def _list_names(names: Sequence[str]) -> str:

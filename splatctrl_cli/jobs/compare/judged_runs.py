@@ -192,9 +192,9 @@ def read_baseline(path: Path) -> JudgedRuns:
         remedy="give one of --update-baseline",
     )
     refuse_if(
-        (found := document.get("version")) != VERSION,
-        f"{path}: a baseline of version {found}, this splatctrl reads {VERSION}",
-        remedy="update splatctrl" if (found or 0) > VERSION else ANEW,
+        (file_version := document.get("version")) != VERSION,
+        f"{path}: a baseline of version {file_version}, this splatctrl reads {VERSION}",
+        remedy="update splatctrl" if (file_version or 0) > VERSION else ANEW,
     )
     version, runs = str(document.get("splatctrl", "")), {}
     with refuse_faults(

@@ -113,15 +113,15 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> Result:
         error=UsageError,
     )
     # these describe a PLY's layout: wrong for the next file
-    kept = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
+    own_comments = {key: value for key, value in comments.items() if key not in {"splat", "label"}}
     name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=request.force, is_folder=False) as partial:
-        kept |= {"exported_from": f"{name} sha256 {sha256(source)}"}
-        back, written = _write_scene(partial, kind, chosen, kept)
+        own_comments |= {"exported_from": f"{name} sha256 {sha256(source)}"}
+        back, written = _write_scene(partial, kind, chosen, own_comments)
         before, after = _gaussians(chosen), _gaussians(back)
         reduced, bound = kind.reduce(before), kind.bound(before)
         bound = replace(bound, center=bound.center + float(np.abs(exact - before.centers).max()))
-        found = _check_differences(out, reduced, after, bound, exact)
+        changes = _check_differences(out, reduced, after, bound, exact)
         largest, psnr, covered = _check_look(out, kind, chosen, back)
         rounded = None if chosen is selected else _look(selected, chosen)[1]
         origin, num_outside = comments.get(ORIGIN), _num_outside(before, reduced)
@@ -135,7 +135,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> Result:
             "origin": origin,
             "not_kept": not_kept,
             "num_outside": num_outside,
-            "differences": asdict(found),
+            "differences": asdict(changes),
             "allowed": asdict(bound),
             "num_views_compared": EXPORT_VIEWS,
             "largest_pixel_difference": largest,
@@ -208,9 +208,11 @@ def _check_differences(
         f"{out}: differs from its source: {len(back)} of {len(reduced)} splats, or other labels",
         error=WriteError,
     )
-    found = differences(reduced, back, exact)
-    refuse_if(beyond := found.beyond(bound), f"{out}: differs from its source: {'; '.join(beyond)}", error=WriteError)
-    return found
+    changes = differences(reduced, back, exact)
+    refuse_if(
+        beyond := changes.beyond(bound), f"{out}: differs from its source: {'; '.join(beyond)}", error=WriteError
+    )
+    return changes
 
 
 def _check_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> tuple[float, float | None, float]:

@@ -41,7 +41,7 @@ class Corrections:
     @property
     def options(self) -> str:
         return " ".join(
-            n for n, given in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if given
+            n for n, is_set in (("--refine-poses", self.poses), ("--refine-exposure", self.exposure)) if is_set
         )
 
     def check(self, source: RecordSource) -> None:
@@ -84,30 +84,32 @@ class Corrections:
 def _correct_poses(
     recorded: list[RgbdFrame], scale: float, has_robot: bool, console: Progress
 ) -> tuple[list[RgbdFrame], dict[str, Any]]:
-    found, frames = refined_poses(recorded, scale), recorded
-    recorded_apart, apart = found.before, found.after  # of the depths as recorded
-    bends = FoundBends() if has_robot else depth_bends(frames, found, scale)
+    refined, frames = refined_poses(recorded, scale), recorded
+    recorded_apart, apart = refined.before, refined.after  # of the depths as recorded
+    bends = FoundBends() if has_robot else depth_bends(frames, refined, scale)
     if bends.grids:
         frames = freed(recorded, bends.grids)
-        found = refined_poses(frames, scale)
-    before, after, median = (1e3 * value for value in (recorded_apart, found.after, float(np.median(found.moved))))
+        refined = refined_poses(frames, scale)
+    before, after, median = (
+        1e3 * value for value in (recorded_apart, refined.after, float(np.median(refined.moved)))
+    )
     console.log(
         f"poses: {len(frames)} views moved by {median:.1f} mm in the median, at most"
-        f" {1e3 * found.moved.max():.1f} mm and {found.turned.max():.2f} deg: surfaces of two views are"
+        f" {1e3 * refined.moved.max():.1f} mm and {refined.turned.max():.2f} deg: surfaces of two views are"
         f" {after:.2f} mm apart instead of {before:.2f}"
-        if found.is_better
+        if refined.is_better
         else f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no correction reduces it"
     )
-    return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
-        "pose_residual": found.after,
+    return [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)], {
+        "pose_residual": refined.after,
         "poses": {
             "residual_before": recorded_apart,
-            "moved_median": float(np.median(found.moved)),
-            "moved_max": float(found.moved.max()),
-            "turned_max": float(found.turned.max()),
-            "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, found.is_held, strict=True) if held],
+            "moved_median": float(np.median(refined.moved)),
+            "moved_max": float(refined.moved.max()),
+            "turned_max": float(refined.turned.max()),
+            "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, refined.is_held, strict=True) if held],
         },
-    } | ({} if has_robot else _describe(bends, scale, apart, found.after, console))
+    } | ({} if has_robot else _describe(bends, scale, apart, refined.after, console))
 
 
 def _describe(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:

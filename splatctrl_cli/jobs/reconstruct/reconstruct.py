@@ -91,14 +91,14 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Jud
                 f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
                 " link and box, or leave it out"
             )
-        made = fitted.result()
-        verdict = reconstruct_verdict(made, request.require)
+        result = fitted.result()
+        verdict = reconstruct_verdict(result, request.require)
         write_run(
             partial,
             command="reconstruct",
             config=fitted.config.as_dict(),
             inputs=inputs,
-            metrics=made.metrics,
+            metrics=result.metrics,
             stopwatch=stopwatch,
             seed=request.seed,
             verdict=verdict.as_dict(),
@@ -106,8 +106,8 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Jud
     removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
     return JudgedResult(
         out=request.out,
-        metrics=made.metrics,
-        document={"scene": request.out, "metrics": made.metrics, "removed": removed},
+        metrics=result.metrics,
+        document={"scene": request.out, "metrics": result.metrics, "removed": removed},
         verdict=verdict,
         seconds=stopwatch.seconds,
     )
@@ -225,9 +225,9 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
         arm = arm_of(model.moved_by(source.joint_names), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
-        found = learn_from(arm, [correct_pose(frame, off) for frame in frames], source.name, request.reach)
-        savez(partial, found.arrays())
-    return found
+        learned = learn_from(arm, [correct_pose(frame, off) for frame in frames], source.name, request.reach)
+        savez(partial, learned.arrays())
+    return learned
 
 
 def arm_of(model: RobotModel, source: FrameSource) -> Arm:
@@ -264,8 +264,8 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
     """
     stamps = stamps_by_camera(source)
     stamps = {camera: its for camera, its in stamps.items() if camera in training_cameras(source)}
-    found = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), 2000)]
-    posed = [(stamp, T) for stamp, T in found if T is not None]
+    surfaces = [(stamp, arm.surface_poses(stamp)) for stamp in spread(min(stamps.values(), key=len), 2000)]
+    posed = [(stamp, T) for stamp, T in surfaces if T is not None]
     refuse_if(not posed, f"{source.name}: no frame has a joint state within {1e-9 * STATES_CLOSE_NS:g} s")
     order = choose_moments(arm.surface, np.array([T for _, T in posed]))
     chosen = frames_nearest(stamps, [posed[number][0] for number in order])

@@ -47,32 +47,32 @@ class Reconstructed:
         return (stamp_ns - self.rows[0].stamp_ns) * 1e-9
 
 
-def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
-    metrics, counts = made.metrics, counts_of(made)
+def reconstruct_verdict(run: Reconstructed, require: Sequence[str]) -> Verdict:
+    metrics, counts = run.metrics, counts_of(run)
     return verdict_of(
         "reconstruct",
         [
-            *(reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)),
-            *_notes(metrics, made.loss),
+            *(reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(run)),
+            *_notes(metrics, run.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
-        notes=[*made.learned, *(carried_words(entry) for entry in metrics["carried"])],
-        is_damaged=bool(made.loss.damaged),
+        notes=[*run.learned, *(carried_words(entry) for entry in metrics["carried"])],
+        is_damaged=bool(run.loss.damaged),
         counts=counts,
     )
 
 
-def counts_of(made: Reconstructed) -> dict[str, int]:
-    links = made.metrics["self_mask"].values()
+def counts_of(run: Reconstructed) -> dict[str, int]:
+    links = run.metrics["self_mask"].values()
     seen = [row["num_pixels"] for row in links]
-    return dict.fromkeys(GATED, len(made.rows)) | {
+    return dict.fromkeys(GATED, len(run.rows)) | {
         "robot_splats": sum(seen),
         "inside_robot_points": sum(seen),
         "self_mask_residual_mm": sum(row["num_pixels"] for row in links if row["is_judged"]),
-        "camera_displacement_mm": sum(row["num_pixels"] for row in made.metrics["displaced_cameras"].values()),
-        "loss": sum(row.loss is not None for row in made.rows),
-        "psnr": sum(row.psnr is not None for row in made.rows),
+        "camera_displacement_mm": sum(row["num_pixels"] for row in run.metrics["displaced_cameras"].values()),
+        "loss": sum(row.loss is not None for row in run.rows),
+        "psnr": sum(row.psnr is not None for row in run.rows),
     }
 
 
@@ -93,8 +93,8 @@ def _notes(metrics: Mapping[str, Any], loss: LossReport) -> Iterator[Reason]:
     yield from (note(criterion="input", sentence=text) for text in loss.notes)
 
 
-def _map(made: Reconstructed) -> Iterator[Reason]:
-    metrics, num = made.metrics, made.metrics["unrepresented_voxels"]
+def _map(run: Reconstructed) -> Iterator[Reason]:
+    metrics, num = run.metrics, run.metrics["unrepresented_voxels"]
     num_splats = metrics["splats"] - metrics["robot_splats"]
     is_empty = num_splats + num == 0
     yield Reason(
@@ -114,23 +114,23 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
             sentence=f"{num} voxels ({1e3 * metrics['unrepresented_volume']:.2f} l) are occupied and have no splat; "
             "they count as obstacles",
             value=float(num),
-            remedy=f"raise --max-splats above {made.config.scene.max_splats}",
+            remedy=f"raise --max-splats above {run.config.scene.max_splats}",
             count=metrics["splats"] + num,
         )
 
 
-def _blind(made: Reconstructed) -> Iterator[Reason]:
-    for camera, num in made.metrics["repeated_frames"].items():
+def _blind(run: Reconstructed) -> Iterator[Reason]:
+    for camera, num in run.metrics["repeated_frames"].items():
         yield note(
             criterion="depth", sentence=f"camera {camera}: left out {num} frames that repeat the depth before them"
         )
-    without = made.metrics["frames_without_depth"]
-    if made.is_seeded or not without:
+    without = run.metrics["frames_without_depth"]
+    if run.is_seeded or not without:
         return
-    longest = longest_blind(made.rows) if made.metrics["has_clock"] else {}
+    longest = longest_blind(run.rows) if run.metrics["has_clock"] else {}
     long = {camera: span for camera, span in longest.items() if (span[1] - span[0]) * 1e-9 > LONGEST_BLIND}
     for camera, (first_ns, last_ns) in long.items():
-        start, end = made.seconds(first_ns), made.seconds(last_ns)
+        start, end = run.seconds(first_ns), run.seconds(last_ns)
         yield note(
             criterion="depth",
             sentence=f"camera {camera} returned no depth from {start:.2f} to {end:.2f} s",
@@ -174,12 +174,12 @@ def displaced_camera(camera: str, row: Mapping[str, Any]) -> Reason:
     )
 
 
-def _calibration(made: Reconstructed) -> Iterator[Reason]:
-    cameras = made.metrics["displaced_cameras"]
+def _calibration(run: Reconstructed) -> Iterator[Reason]:
+    cameras = run.metrics["displaced_cameras"]
     yield from (displaced_camera(camera, row) for camera, row in cameras.items() if is_displaced(row))
-    medians = {link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["is_judged"]}
+    medians = {link: row["median_mm"] for link, row in run.metrics["self_mask"].items() if row["is_judged"]}
     if not medians:
-        if made.metrics.get("robot_links") and not made.metrics["self_mask"] and not made.is_seeded:
+        if run.metrics.get("robot_links") and not run.metrics["self_mask"] and not run.is_seeded:
             yield note(
                 criterion="calibration",
                 sentence="no camera sees the robot where its joints put it",
@@ -187,7 +187,7 @@ def _calibration(made: Reconstructed) -> Iterator[Reason]:
             )
         return
     link = max(medians, key=lambda name: abs(medians[name]))
-    median, allowed = medians[link], 1e3 * made.config.occupancy.self_mask_tolerance
+    median, allowed = medians[link], 1e3 * run.config.occupancy.self_mask_tolerance
     is_off = abs(median) > allowed
     side = "behind" if median > 0 else "before"
     yield Reason(
@@ -200,19 +200,19 @@ def _calibration(made: Reconstructed) -> Iterator[Reason]:
         unit="mm",
         who=link,
         remedy="calibrate camera and robot again, or raise occupancy.self_mask_tolerance" if is_off else "",
-        count=int(made.metrics["self_mask"][link]["num_pixels"]),
+        count=int(run.metrics["self_mask"][link]["num_pixels"]),
         is_note=is_off,
     )
 
 
-def _inside(made: Reconstructed) -> Iterator[Reason]:
-    num, link = made.metrics["inside_robot_points"], made.metrics["inside_robot_first_link"]
+def _inside(run: Reconstructed) -> Iterator[Reason]:
+    num, link = run.metrics["inside_robot_points"], run.metrics["inside_robot_first_link"]
     if num:
         yield note(
             criterion="points inside the robot",
             sentence=f"{num} measured points, which its surface does not explain, first in {link}",
             value=float(num),
-            time_s=made.seconds(made.metrics["inside_robot_first_ns"]),
+            time_s=run.seconds(run.metrics["inside_robot_first_ns"]),
             who=link,
             remedy="look for contact, a carried object, or a wrong calibration ('splatctrl check')",
             count=num,

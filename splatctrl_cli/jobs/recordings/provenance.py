@@ -125,8 +125,8 @@ def scene_mismatches(
         )
     if scene.has_clock and len(states):
         stamps = [*(snapshot.stamp_ns for snapshot in scene.snapshots), scene.stamp_ns]
-        if (found := times_apart(states.stamp_ns, (min(stamps), max(stamps)))) is not None:
-            yield found
+        if (gap := times_apart(states.stamp_ns, (min(stamps), max(stamps)))) is not None:
+            yield gap
     yield from _map_mismatches(scene)
 
 
@@ -139,10 +139,10 @@ def made_from_mismatches(
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
-    made, given = _calibrations(files), _calibrations(digests)
-    if made.keys() != given.keys():
+    made, current = _calibrations(files), _calibrations(digests)
+    if made.keys() != current.keys():
         with_made, with_given = (
-            f"with {', '.join(names.values())}" if names else "without one" for names in (made, given)
+            f"with {', '.join(names.values())}" if names else "without one" for names in (made, current)
         )
         yield lacking(
             sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
@@ -214,16 +214,16 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
     if known is None:
         return
     used = scene.run.get("config", {})
-    found = agreement_with_grid(
+    agreement = agreement_with_grid(
         scene.splats(),
         known,
         _read_section(SceneConfig, used.get("scene")),
         _read_section(OccupancyConfig, used.get("occupancy")),
     )
-    if not found.holds and found.num_voxels:
+    if not agreement.holds and agreement.num_voxels:
         yield lacking(
-            sentence=f"{scene.path}: splats and occupancy disagree: {100 * found.on_surface:.0f} % of the splats "
-            f"lie on occupied voxels, {100 * found.represented:.0f} % of {found.num_voxels} occupied "
+            sentence=f"{scene.path}: splats and occupancy disagree: {100 * agreement.on_surface:.0f} % of the splats "
+            f"lie on occupied voxels, {100 * agreement.represented:.0f} % of {agreement.num_voxels} occupied "
             "voxels are represented",
             remedy="check the splats' units and frame, or reconstruct again",
         )

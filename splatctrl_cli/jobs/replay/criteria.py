@@ -67,8 +67,8 @@ def worst_state(
 
 def largest_about(trace: Trace, column: str) -> float | None:
     """The largest value about the arm; None if the space about it was not evaluated."""
-    found = worst_state(trace, trace[column], np.nanargmax)
-    return None if found is None else found.value
+    largest = worst_state(trace, trace[column], np.nanargmax)
+    return None if largest is None else largest.value
 
 
 Number = float | Callable[[Judged], float]
@@ -102,20 +102,22 @@ class Bound:
     def __call__(self, judged: Judged) -> Iterator[Reason]:
         """Yield the reason; none without a value."""
         least = self.above or judged.replay.margin
-        found = self.on(judged) if callable(self.on) else self._worst_state(judged.replay.trace, least)
-        if found is None or found.value is None:
+        worst = self.on(judged) if callable(self.on) else self._worst_state(judged.replay.trace, least)
+        if worst is None or worst.value is None:
             return
-        given = next(number for number in (self.at_most, self.at_least, least) if number is not None)
-        allowed, tolerance = (number(judged) if callable(number) else number for number in (given, self.tolerance))
-        value = found.value
+        threshold = next(number for number in (self.at_most, self.at_least, least) if number is not None)
+        allowed, tolerance = (
+            number(judged) if callable(number) else number for number in (threshold, self.tolerance)
+        )
+        value = worst.value
         words = {
             **{"value": value, "negated": -value, "mm": mm(value), "ms": 1e3 * value, "percent": 100 * value},
             **{"allowed": allowed, "allowed_mm": mm(allowed), "allowed_percent": 100 * allowed},
-            **{"who": found.who, "words": found.sentence},
+            **{"who": worst.who, "words": worst.sentence},
         }
         if self.breaks(value, allowed, tolerance):
             yield replace(
-                found,
+                worst,
                 outcome=self.outcome,
                 sentence=self.say.format(**words),
                 threshold=allowed,
@@ -124,7 +126,7 @@ class Bound:
                 label=self.label,
             )
         elif self.passed:
-            yield passed_reason(self.passed.format(**words), value, allowed, self.unit, found.count or 0)
+            yield passed_reason(self.passed.format(**words), value, allowed, self.unit, worst.count or 0)
 
     def breaks(self, values: Any, allowed: float, tolerance: float = 0.0) -> Any:
         """True for values that are not allowed."""
@@ -156,14 +158,14 @@ class Bound:
     def _worst_state(self, trace: Trace, least: float) -> Reason | None:
         """Add to `above` the place and the number of broken states."""
         values, pick = self.values(trace), np.nanargmin if self.at_most is None else np.nanargmax
-        found = worst_state(trace, values, pick, trace[self.who] if self.who else ())
-        if found is None or (self.at_most, self.at_least) != (None, None):
-            return found
+        worst = worst_state(trace, values, pick, trace[self.who] if self.who else ())
+        if worst is None or (self.at_most, self.at_least) != (None, None):
+            return worst
         at, places = int(pick(values)), trace["class_places" if self.parts else f"{self.on}_place"]
         nearest = min(self.parts, key=lambda kind: float(trace[str(self.on)][at, kind]), default=0)
         place = tuple(places[at, 3 * nearest : 3 * nearest + 3].tolist())
         cause = "at ({:.2f}, {:.2f}, {:.2f}) m".format(*place)
-        return replace(found, place=place, cause=cause, count=int((values <= least).sum()))
+        return replace(worst, place=place, cause=cause, count=int((values <= least).sum()))
 
 
 def controller(judged: Judged) -> Iterator[Reason]:
@@ -196,10 +198,10 @@ def controller(judged: Judged) -> Iterator[Reason]:
         return
     kinds = [kind for kind in EventKind if bad.get(kind.replace("-", "_"))]
     first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
-    found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
+    counts = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
     yield failed(
         sentence=f"constraints could not be satisfied at {sum(bad.values()):.0f} of {len(trace.steps)} steps "
-        f"({found}), first",
+        f"({counts}), first",
         value=float(sum(bad.values())),
         threshold=0.0,
         time_s=first.start_s,

@@ -163,34 +163,34 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     With a smaller clearance no contact was seen, but the map cannot exclude one: not evaluable, unless another
     criterion fails. The same holds for too little evidence.
     """
-    found, surface = judged.replay.map_error, lowest(judged.replay.trace["clearance_surface"])
-    if found is None and judged.request.require_evidence:
+    measured, surface = judged.replay.map_error, lowest(judged.replay.trace["clearance_surface"])
+    if measured is None and judged.request.require_evidence:
         yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
-    if found is not None and found.bound is None:
+    if measured is not None and measured.bound is None:
         yield lacking(
-            sentence=f"not bounded: {found.num_seen} of {found.num_sets} held-out frame sets show surface near the "
-            "motion, too few for two independent stretches",
-            who=found.source,
+            sentence=f"not bounded: {measured.num_seen} of {measured.num_sets} held-out frame sets show surface near "
+            "the motion, too few for two independent stretches",
+            who=measured.source,
             remedy="judge a longer motion, name another camera, or raise verdict.evidence_reach",
-            count=found.num_seen,
+            count=measured.num_seen,
         )
-    if found is None or found.bound is None or surface is None:  # no distance at any state: others report it
+    if measured is None or measured.bound is None or surface is None:  # no distance at any state: others report it
         return
-    value = found.bound.bound
+    value = measured.bound.bound
     if surface >= value:
-        yield passed_reason(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        yield passed_reason(bound_words(measured.bound), surface - value, 0.0, "m", measured.num_points)
         return
     yield lacking(
-        sentence=f"{bound_words(found.bound)}, but the clearance is only {mm(surface)}; largest miss",
+        sentence=f"{bound_words(measured.bound)}, but the clearance is only {mm(surface)}; largest miss",
         value=surface - value,
         threshold=0.0,
         unit="m",
-        time_s=found.time_s,
-        place=found.place,
-        who=found.source,
-        cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
+        time_s=measured.time_s,
+        place=measured.place,
+        who=measured.source,
+        cause="" if measured.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*measured.place),
         remedy="for a smaller error, add cameras, or raise frame rate or --max-splats",
-        count=found.num_points,
+        count=measured.num_points,
     )
 
 

@@ -244,11 +244,13 @@ def _intervals(
     replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
     """Spans [s] of shown events by kind and measure, with all of `at_least`."""
-    found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
+    intervals: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):
-            found.setdefault(f"{event.kind}{SHOWN.get(event.source, '')}", []).append((event.start_s, event.end_s))
-    return found
+            intervals.setdefault(f"{event.kind}{SHOWN.get(event.source, '')}", []).append(
+                (event.start_s, event.end_s)
+            )
+    return intervals
 
 
 def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterable[RgbdFrame]) -> list[Sight | None]:

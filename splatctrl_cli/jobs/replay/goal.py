@@ -58,8 +58,8 @@ def check_goal(request: ReplayRequest) -> None:
     controlled, driven = ("open-loop", "closed-loop"), ("closed-loop",)
     modes = {"re_anchor": driven, **dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), controlled)}
     for option, wanted in modes.items():
-        given = getattr(request, option)
-        if given is not None and given is not False and request.mode not in wanted:
+        value = getattr(request, option)
+        if value is not None and value is not False and request.mode not in wanted:
             name = "--" + option.replace("_", "-")
             raise UsageError(
                 f"{name}: expected --mode {' or '.join(wanted)}, got {request.mode}", remedy=f"leave out {name}"

@@ -117,10 +117,10 @@ def measured_robot(
             f"control.coverage = margin: expected spheres on every link that moves, got none on {', '.join(bare)}",
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
         )
-    kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
+    pair_margins = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
     fixtures = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
-    model = apply_kept_margins(model, config.self_margin, kept)
-    return MeasuredRobot(model=model, surfaces=surfaces, pair_margins=(*kept, *fixtures))
+    model = apply_kept_margins(model, config.self_margin, pair_margins)
+    return MeasuredRobot(model=model, surfaces=surfaces, pair_margins=(*pair_margins, *fixtures))
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
@@ -162,9 +162,9 @@ def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[s
     return words
 
 
-def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
+def _self_margin_words(robot: MeasuredRobot, pair_margins: Sequence[KeptMargin], config: ControlConfig) -> str:
     each = ", ".join(
-        f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_gap_words(pair)}" for pair in kept
+        f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_gap_words(pair)}" for pair in pair_margins
     )
     judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
     return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
@@ -259,8 +259,8 @@ class LoggedStates:
     def lines(self) -> list[str]:
         notes = self.source.loss.notes
         more = [f"and {len(notes) - MAX_NOTES} more notes in states.json"] if len(notes) > MAX_NOTES else []
-        found = [check.sentence for check in (self.poses, self.clock) if check is not None]
-        return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *found)]
+        sentences = [check.sentence for check in (self.poses, self.clock) if check is not None]
+        return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *sentences)]
 
 
 def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:

@@ -124,7 +124,7 @@ def fields_at(
 
     The lookup raises NotEvaluableError before the first scene is known.
     """
-    kept = lru_cache(maxsize=HELD)(fields_of)
+    cached = lru_cache(maxsize=HELD)(fields_of)
 
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(known_ns, stamp_ns) - 1
@@ -134,7 +134,7 @@ def fields_at(
             remedy="give a later time",
             error=NotEvaluableError,
         )
-        return kept(key_of(index))
+        return cached(key_of(index))
 
     return at
 
@@ -147,7 +147,7 @@ def read_grid_scene(path: Path) -> KnownScene:
     states = grid.channels.get("observed")
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
     seen = None if observed is None else _grid_seen(observed, grid)
-    made_from = made if isinstance(made := grid.header.get("made_from"), dict) else {}
+    made_from = origins if isinstance(origins := grid.header.get("made_from"), dict) else {}
     fields = KnownFields(
         barrier=barrier,
         distances={

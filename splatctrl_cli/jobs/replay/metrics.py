@@ -328,12 +328,12 @@ def metrics_of(replay: Replay) -> Metrics:
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
     """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
-    found = dict.fromkeys(metrics, replay.num_states)
-    found |= {metric.name: metric.count(replay) for metric in _metrics_of(replay)}
+    counts = dict.fromkeys(metrics, replay.num_states)
+    counts |= {metric.name: metric.count(replay) for metric in _metrics_of(replay)}
     for field, agreement in replay.agreement.items():
         compared = int(agreement["num_compared"] or 0)
-        found |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
-    return {name: (found | logged.counts())[name] for name in metrics}
+        counts |= {f"truth_{name}_{field}": compared for name in AGREEMENT if name != "num_compared"}
+    return {name: (counts | logged.counts())[name] for name in metrics}
 
 
 def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:

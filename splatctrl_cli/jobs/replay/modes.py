@@ -51,7 +51,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Rep
     frame = request.frame or model.frame_names[-1]
     twists = twist_track(request, model, inputs.states.stamp_ns, console)
     task = OpenLoopTask(frame=frame, twists=twists)
-    if any(given is not None for given in (request.goal, request.goal_joints, request.waypoints)):
+    if any(goal is not None for goal in (request.goal, request.goal_joints, request.waypoints)):
         goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")

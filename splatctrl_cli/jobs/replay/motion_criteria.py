@@ -158,13 +158,13 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     recorded. Gaps are of collision surfaces, or of spheres if these cannot be read.
     """
     trace = judged.replay.trace
-    found = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
-    least = np.inf if found is None or found.value is None else found.value
-    if found is not None and least < 0:
+    worst = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
+    least = np.inf if worst is None or worst.value is None else worst.value
+    if worst is not None and least < 0:
         yield replace(
-            found,
+            worst,
             outcome=Outcome.FAILED,
-            sentence=f"{found.who} overlap by {mm(-least)}",
+            sentence=f"{worst.who} overlap by {mm(-least)}",
             threshold=0.0,
             unit="m",
             remedy="name pairs that may touch with --srdf",
@@ -179,8 +179,8 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def _check_fixture(judged: Judged) -> Reason | None:
-    found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
-    gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
+    fixtures = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
+    gap, stamp, pair = min(fixtures, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
     if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
         return None
     return failed(

@@ -127,9 +127,9 @@ def _how(judged: Judged) -> str:
 
 
 def _notes(judged: Judged) -> Iterator[str]:
-    found = judged.replay.map_error
+    error = judged.replay.map_error
     yield (
-        "map error not measured" if found is None or found.bound is None else f"map error {bound_words(found.bound)}"
+        "map error not measured" if error is None or error.bound is None else f"map error {bound_words(error.bound)}"
     )
     if close := [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]:
         yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
@@ -159,10 +159,10 @@ def waivers(request: ReplayRequest) -> Iterator[str]:
     """Options and settings of evidence and margins laxer than their defaults."""
     usual = ReplayRequest(log=request.log, out=request.out)
     for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
-        given, default = (attrgetter(name)(each) for each in (request, usual))
-        if given > default if name in LARGER_IS_LAXER else given < default:
+        value, default = (attrgetter(name)(each) for each in (request, usual))
+        if value > default if name in LARGER_IS_LAXER else value < default:
             words = name.removeprefix("config.") if "." in name else f"--{name.replace('_', '-')}"
-            yield f"waived: {words}" + ("" if given is True else f" {given:g} (by default {default:g})")
+            yield f"waived: {words}" + ("" if value is True else f" {value:g} (by default {default:g})")
 
 
 def _declared_notes(judged: Judged) -> Iterator[str]:
@@ -178,10 +178,10 @@ def _declared_notes(judged: Judged) -> Iterator[str]:
         yield f"contact of {entry.link} {how} ({entry.reason}): {used}"
     of_map = judged.inputs.scene.figures().get("carried", [])
     yield from map(carried_words, of_map)
-    for given in declared.carried_uses():
-        if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
+    for use in declared.carried_uses():
+        if not any(use | {"num_uses": 0} == mapped | {"num_uses": 0} for mapped in of_map):
             yield (
-                f"{given['link']} carries a box: warning: the map was made without this declaration; give reconstruct"
+                f"{use['link']} carries a box: warning: the map was made without this declaration; give reconstruct"
                 " the same --declare"
             )
 
@@ -213,36 +213,47 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         for doubt in doubts_of(request, robot, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
-            found = replayed(request, inputs, progress)
+            replayed_run = replayed(request, inputs, progress)
         inputs.scene.finish()
         logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
-            found, sights = _watch(request, inputs, found)
+            replayed_run, sights = _watch(request, inputs, replayed_run)
         if evidence is not None:
             with stopwatch.stage("evidence"):
-                found = replace(found, map_error=map_error(evidence, inputs, found.trace, config.verdict))
+                replayed_run = replace(
+                    replayed_run, map_error=map_error(evidence, inputs, replayed_run.trace, config.verdict)
+                )
         if inputs.separation is not None:
             with stopwatch.stage("separation"):
-                found = add_separation(inputs.separation, inputs, found)
-        metrics = metrics_of(found) | logged.metrics()
+                replayed_run = add_separation(inputs.separation, inputs, replayed_run)
+        metrics = metrics_of(replayed_run) | logged.metrics()
         with stopwatch.stage("verdict"):
             verdict = replay_verdict(
-                Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
+                Judged(request=request, inputs=inputs, logged=logged, replay=replayed_run, metrics=metrics)
             )
         with stopwatch.stage("worst_frames"):
-            unseen = draw_worst_frames(folder, found, sights)
+            unseen = draw_worst_frames(folder, replayed_run, sights)
         write_json(folder / "states.json", logged.as_dict())
-        of_robot = words_of(robot, config.control, () if found.closed_loop is None else found.closed_loop.by_surface)
+        of_robot = words_of(
+            robot, config.control, () if replayed_run.closed_loop is None else replayed_run.closed_loop.by_surface
+        )
         write_replay(
-            folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
+            folder,
+            replayed_run,
+            metrics,
+            verdict,
+            of_robot,
+            config=config,
+            inputs=inputs.digests,
+            stopwatch=stopwatch,
         )
     return ReplayResult(
         out=request.out,
         inputs=inputs,
-        replay=found,
+        replay=replayed_run,
         metrics=metrics,
         verdict=verdict,
-        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(found, metrics)),
+        notes=(*of_robot.values(), *unseen, *logged.lines(), *separation_lines(replayed_run, metrics)),
         is_damaged=bool(inputs.source.loss.damaged),
     )
 

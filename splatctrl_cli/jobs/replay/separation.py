@@ -62,8 +62,12 @@ def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: R
 
     Raises InputError for maps without times, or without any labelled person where labels are to tell.
     """
-    given = (*_person_inputs(declared), *_time_inputs(declared, inputs), *_distance_inputs(declared, inputs, replay))
-    judge = _SeparationPass(declared, inputs, replay, {each.symbol: each.value for each in given})
+    separation_inputs = (
+        *_person_inputs(declared),
+        *_time_inputs(declared, inputs),
+        *_distance_inputs(declared, inputs, replay),
+    )
+    judge = _SeparationPass(declared, inputs, replay, {each.symbol: each.value for each in separation_inputs})
     for first, last in blocks_of(inputs.scene, inputs.model, replay.trace.stamp_ns):
         replay.trace.append(judge.columns(first, last))
     refuse_if(
@@ -71,7 +75,7 @@ def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: R
         f"{inputs.source.name}: person.who = 'labelled': no map has a surface with depth and a person's label",
         remedy="record masks of people with depth (--human-topic of reconstruct), or declare who = 'newcomer'",
     )
-    return replace(replay, separation=given)
+    return replace(replay, separation=separation_inputs)
 
 
 def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
@@ -87,10 +91,12 @@ def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
     yield SeparationInput(symbol="C", value=declared.intrusion, unit="m", source=DECLARED, how="intrusion distance")
 
 
-def _number(symbol: str, unit: str, given: float | None, how: str, default: float, why: str) -> SeparationInput:
+def _number(
+    symbol: str, unit: str, declared_value: float | None, how: str, default: float, why: str
+) -> SeparationInput:
     """The declared number, else the assumed one and why."""
-    if given is not None:
-        return SeparationInput(symbol=symbol, value=given, unit=unit, source=DECLARED, how=how)
+    if declared_value is not None:
+        return SeparationInput(symbol=symbol, value=declared_value, unit=unit, source=DECLARED, how=how)
     return SeparationInput(symbol=symbol, value=default, unit=unit, source=ASSUMED, how=why)
 
 
@@ -127,10 +133,10 @@ def _time_inputs(declared: DeclaredSeparation, inputs: ReplayInputs) -> Iterator
 
 def _distance_inputs(declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay) -> Iterator[SeparationInput]:
     """The constant parts of Z_d and Z_r."""
-    figures, found = inputs.scene.figures(), replay.map_error
-    if declared.map_error is None and found is not None and found.bound is not None:
-        how = f"bound on the map's error, {100 * found.bound.confidence:.3g} % confidence; plus v_h times the age"
-        yield SeparationInput(symbol="Z_d", value=found.bound.bound, unit="m", source=MEASURED, how=how)
+    figures, map_error = inputs.scene.figures(), replay.map_error
+    if declared.map_error is None and map_error is not None and map_error.bound is not None:
+        how = f"bound on the map's error, {100 * map_error.bound.confidence:.3g} % confidence; plus v_h times the age"
+        yield SeparationInput(symbol="Z_d", value=map_error.bound.bound, unit="m", source=MEASURED, how=how)
     else:
         assumed = VOXELS * float(figures.get("voxel") or VOXEL)
         why = f"{VOXELS} voxels of the map, for --evidence is missing; plus v_h times the evidence's age"

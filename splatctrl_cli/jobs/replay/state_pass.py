@@ -171,31 +171,33 @@ class ReplayRecord:
         clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
         known = self._scene.at(int(part.stamp_ns[0]))
         for name, each in part.of_spheres.items():
-            kept = of_spheres[name] = self._unexpected(known, part.stamp_ns, part.position, each)
-            nearest = kept.argmin(axis=1)
-            clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
+            unexpected = of_spheres[name] = self._unexpected(known, part.stamp_ns, part.position, each)
+            nearest = unexpected.argmin(axis=1)
+            clearance[name] = Clearance(
+                distance=unexpected[np.arange(len(unexpected)), nearest], sphere=moving[nearest]
+            )
         return replace(part, clearance=clearance, of_spheres=of_spheres)
 
     def _unexpected(self, known: KnownFields, stamps: Stamps, positions: Float64, each: Float64) -> Float64:
         """Clearances `each` (T, M) [m] of moving spheres, infinite where contact is declared."""
-        links, kept = self._model.sphere_set.links, each.copy()
+        links, unexpected = self._model.sphere_set.links, each.copy()
         for state, column in zip(*np.nonzero(each < self._margin), strict=True):
             sphere = int(self._reach.moving[column])
             center = self._model.sphere_centers(positions[state])[[sphere]]
             place = np.array(known.obstacles(center)[0].position)
             if self._declared.find_expected(links[sphere], place, (int(stamps[state]) - self._first_state_ns) * 1e-9):
-                kept[state, column] = np.inf
-        return kept
+                unexpected[state, column] = np.inf
+        return unexpected
 
     def clearance_in(self, scene_ns: int, stamps: Stamps, positions: Float64) -> Float64:
         """Return clearances (T,) [m] of states (T, J) in the scene known at `scene_ns`, without declared contact."""
-        known, found = self._scene.at(scene_ns), []
+        known, gaps = self._scene.at(scene_ns), []
         for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
             if len(its):
                 robot = self._robot.at(int(stamps[its[0]]))
                 each = moving_clearance(robot, positions[its], known.distances["exact"])[1]
-                found.append(self._unexpected(known, stamps[its], positions[its], each).min(axis=1))
-        return np.concatenate(found)
+                gaps.append(self._unexpected(known, stamps[its], positions[its], each).min(axis=1))
+        return np.concatenate(gaps)
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
         """Use gaps of link surfaces where known, and record pairs below their margin."""
@@ -296,14 +298,14 @@ class ReplayRecord:
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         nearest = part.clearance["barrier"]
-        found: list[Obstacle | None] = [None] * len(part.stamp_ns)
+        closest: list[Obstacle | None] = [None] * len(part.stamp_ns)
         if len(states := np.flatnonzero(np.isfinite(nearest.distance))):
             centers = self._model.sphere_centers_batch(part.position[states])
             points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
             obstacles = self._scene.at(int(part.stamp_ns[0])).obstacles(points)
             for state, obstacle in zip(states.tolist(), obstacles, strict=True):
-                found[state] = obstacle
-        return found
+                closest[state] = obstacle
+        return closest
 
 
 def _fold_accounts(accounts: Sequence[Account]) -> dict[str, float | Float64]:

@@ -17,12 +17,12 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     After half a second without any, the next depth shows nothing where the arm was. A baked field has no times.
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
-    for found in judged.replay.unwatched:
-        since, until, when = ((ns - first_ns) * 1e-9 for ns in (found.since_ns, found.depth_ns, found.stamp_ns))
+    for later in judged.replay.unwatched:
+        since, until, when = ((ns - first_ns) * 1e-9 for ns in (later.since_ns, later.depth_ns, later.stamp_ns))
         yield lacking(
             sentence=f"no camera gave depth near the arm from {since:.2f} to {until:.2f} s, and then an obstacle "
-            f"is {mm(found.clearance)} from the arm's place, margin {mm(margin)},",
-            value=found.clearance,
+            f"is {mm(later.clearance)} from the arm's place, margin {mm(margin)},",
+            value=later.clearance,
             threshold=margin,
             unit="m",
             time_s=when,
@@ -71,12 +71,12 @@ def _oldest_map(judged: Judged) -> Reason | None:
     """The oldest map, and the interval about it."""
     trace = judged.replay.trace
     ages = trace["map_age_s"]
-    found = worst_state(trace, ages, np.nanargmax)
+    oldest = worst_state(trace, ages, np.nanargmax)
     is_old = np.append(ages > OLDEST(judged), False)
-    if found is None or not is_old.any():
-        return found
+    if oldest is None or not is_old.any():
+        return oldest
     first, end = next((first, end) for first, end in runs_of(is_old) if first <= np.nanargmax(ages) < end)
-    return replace(found, sentence=f"from {trace.seconds(first):.2f} to {trace.seconds(end - 1):.2f} s")
+    return replace(oldest, sentence=f"from {trace.seconds(first):.2f} to {trace.seconds(end - 1):.2f} s")
 
 
 MAP_AGE = Bound(
@@ -107,8 +107,8 @@ def map_age(judged: Judged) -> Iterator[Reason]:
 
 def _overtaken(judged: Judged) -> Iterator[Reason]:
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
-    found = sorted(judged.replay.overtaken, key=lambda each: each.clearance)
-    for worst in [each for each in found if each.depth_ns <= each.stamp_ns][:1]:
+    overtaken = sorted(judged.replay.overtaken, key=lambda each: each.clearance)
+    for worst in [each for each in overtaken if each.depth_ns <= each.stamp_ns][:1]:
         yield failed(
             sentence=f"depth of {(worst.depth_ns - first_ns) * 1e-9:.2f} s, not yet in the map of that time, "
             f"shows an obstacle {mm(worst.clearance)} from the arm, margin {mm(margin)},",
@@ -120,7 +120,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             count=judged.replay.num_states,
             label=CONTACT if worst.clearance < 0 else MARGIN,
         )
-    for last in [each for each in found if each.depth_ns > each.stamp_ns][:1]:
+    for last in [each for each in overtaken if each.depth_ns > each.stamp_ns][:1]:
         yield lacking(
             sentence=f"the next depth, {(last.depth_ns - last.stamp_ns) * 1e-9:.2f} s after the last state, shows an "
             f"obstacle {mm(last.clearance)} from the arm, margin {mm(margin)},",

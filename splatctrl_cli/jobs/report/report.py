@@ -65,8 +65,8 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Re
         else _page_of_run(request, open_run(request.path))
     )
     notes = tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space)
-    made = _write(request, page, num_runs=len(page.runs), num_scenes=len(page.scenes))
-    return replace(made, notes=notes, document={**made.document, "notes": notes})
+    written = _write(request, page, num_runs=len(page.runs), num_scenes=len(page.scenes))
+    return replace(written, notes=notes, document={**written.document, "notes": notes})
 
 
 def _write(request: FolderRequest, page: Page, **figures: int) -> Result:
@@ -190,16 +190,16 @@ def _page_of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Pr
 
 def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
     shown = {job.ran.recording for job in jobs if job.ran.node in linked and job.run is not None}
-    found = list[Picture]()
+    pictures = list[Picture]()
     for command, (name, words) in WITH_PICTURES.items():
         for job in jobs:
             run, recording = job.run, job.ran.recording
-            if run is None or run.command != command or recording in shown or len(found) == MOST_PICTURES:
+            if run is None or run.command != command or recording in shown or len(pictures) == MOST_PICTURES:
                 continue
             files = [path for path in run.pictures() if name in path.stem]
             shown |= {recording} if files else set()
-            found += [picture(path, f"{job.ran.node}: {words}", PICTURE_WIDTH) for path in files[:1]]
-    return found
+            pictures += [picture(path, f"{job.ran.node}: {words}", PICTURE_WIDTH) for path in files[:1]]
+    return pictures
 
 
 def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:

@@ -39,13 +39,13 @@ def section_of(
     states = run.states
     replayed: dict[str, Any] = {}
     if states is not None and len(states.seconds):
-        about = (run.json_of("summary.json") or {}).get("about", {})
+        described = (run.json_of("summary.json") or {}).get("about", {})
         drawn = timeline(
-            states.seconds, states.clearance, float(about.get("margin", 0.0)), _events(run), states.rungs
+            states.seconds, states.clearance, float(described.get("margin", 0.0)), _events(run), states.rungs
         )
         replayed = {"timeline": drawn, "legend": legend(states.clearance)}
-    found = (run.json_of("summary.json") or {}).get("when_and_why", []) if states is not None else []
-    held = _reasons(verdict, holds=True)
+    lines = (run.json_of("summary.json") or {}).get("when_and_why", []) if states is not None else []
+    passed = _reasons(verdict, holds=True)
     figures = [((name, value), "") for name, value in run.metrics.items() if not isinstance(value, dict | list)]
     return RunSection(
         anchor=anchor,
@@ -53,11 +53,11 @@ def section_of(
         state=str(verdict.get("outcome", "done")),
         sentence=str(verdict.get("sentence", f"{run.command}: done; it judges nothing")),
         reasons=_reasons(verdict, holds=False),
-        lines=[str(line) for line in found],
+        lines=[str(line) for line in lines],
         pictures=_pictures(run, most_pictures, width, has_timeline=states is not None),
         details=[
             *_separation(run),
-            *([replace(held, title=f"Criteria that hold ({len(held.rows)})")] if held.rows else []),
+            *([replace(passed, title=f"Criteria that hold ({len(passed.rows)})")] if passed.rows else []),
             Table(title="Figures", header=("name", "value"), rows=figures[:400]),
             _settings(run),
             _provenance(run),
@@ -78,11 +78,11 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 
 def _separation(run: RunFolder) -> list[Table]:
     """Tables of the protective separation distance and its inputs; none without ``separation.json``."""
-    found = run.json_of("separation.json")
-    if found is None:
+    separation = run.json_of("separation.json")
+    if separation is None:
         return []
-    figures = [((each["meaning"], each["value"], each["unit"]), "") for each in found["figures"]]
-    assumed_first = sorted(found["inputs"], key=lambda each: str(each["source"]))
+    figures = [((each["meaning"], each["value"], each["unit"]), "") for each in separation["figures"]]
+    assumed_first = sorted(separation["inputs"], key=lambda each: str(each["source"]))
     inputs = [
         ((each["symbol"], each["value"], each["unit"], each["source"], each["how"]), "") for each in assumed_first
     ]
@@ -91,7 +91,7 @@ def _separation(run: RunFolder) -> list[Table]:
             title="Separation from people",
             header=("figure", "value", "unit"),
             rows=figures,
-            text=f"{found['standard']}. {found['claim']}",
+            text=f"{separation['standard']}. {separation['claim']}",
         ),
         Table(
             title="Inputs of the separation: measured, declared or assumed",
@@ -102,12 +102,12 @@ def _separation(run: RunFolder) -> list[Table]:
 
 
 def _events(run: RunFolder) -> dict[str, list[tuple[float, float]]]:
-    found: dict[str, list[tuple[float, float]]] = {}
+    intervals: dict[str, list[tuple[float, float]]] = {}
     shown = [event for event in (run.json_of("events.json") or {}).get("events", []) if event["source"] in SHOWN]
     for event in sorted(shown, key=lambda event: event["kind"] in INTERVENTIONS):
         name = f"{event['kind']}{SHOWN[event['source']]}"
-        found.setdefault(name, []).append((float(event["start_s"]), float(event["end_s"])))
-    return found
+        intervals.setdefault(name, []).append((float(event["start_s"]), float(event["end_s"])))
+    return intervals
 
 
 def _pictures(run: RunFolder, most: int | None, width: int, *, has_timeline: bool) -> list[Any]:
@@ -135,7 +135,7 @@ def _settings(run: RunFolder) -> Table:
 
 
 def _provenance(run: RunFolder) -> Table:
-    about = {
+    origin = {
         "splatctrl": run.run.get("splatctrl"),
         "python": run.run.get("python"),
         "machine": run.run.get("machine"),
@@ -145,7 +145,7 @@ def _provenance(run: RunFolder) -> Table:
         **{f"sha256 of {name}": value for name, value in dict(run.run.get("inputs", {})).items()},
     }
     return Table(
-        title="Versions and provenance", header=("what", "value"), rows=[(item, "") for item in about.items()]
+        title="Versions and provenance", header=("what", "value"), rows=[(item, "") for item in origin.items()]
     )
 
 
@@ -162,7 +162,7 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
     if before is None:
         return [], frozenset()
     is_folder = before.is_dir()
-    found = compare(
+    comparison = compare(
         CompareRequest(runs=(before, after) if is_folder else (after,), against=None if is_folder else before)
     )
 
@@ -187,22 +187,22 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
             for one in figures
         ]
 
-    worse = [one for one in found.figures if one.change is Change.WORSE]
-    better = rows([one for one in found.figures if one.change is Change.BETTER])
+    worse = [one for one in comparison.figures if one.change is Change.WORSE]
+    better = rows([one for one in comparison.figures if one.change is Change.BETTER])
     first = [
         (
             (job(one["run"]), "verdict", one["before"], one["after"], one["change"], None, None, None),
             STATES.get(one["change"], ""),
         )
-        for one in found.verdicts
+        for one in comparison.verdicts
     ]
-    unlike = [(("", name, *values, "not alike", "", "", ""), "") for name, values in found.differences.items()]
+    unlike = [(("", name, *values, "not alike", "", "", ""), "") for name, values in comparison.differences.items()]
     changed = Table(
         title="What changed",
         header=HEADER,
         rows=[*first, *rows(worse), *unlike],
-        text=". ".join([found.verdict.sentence, *map(str, found.verdict.shown)]),
+        text=". ".join([comparison.verdict.sentence, *map(str, comparison.verdict.shown)]),
     )
     folded = Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
     tables = [changed, folded] if better else [changed]
-    return tables, frozenset([one["run"] for one in found.verdicts] + [one.run for one in worse])
+    return tables, frozenset([one["run"] for one in comparison.verdicts] + [one.run for one in worse])

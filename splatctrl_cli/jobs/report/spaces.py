@@ -72,8 +72,8 @@ def space_of_grid(path: Path) -> Space:
         header=grid.header,
     )
     try:
-        found = iso_surface(thinned)
-        surface = Surface(vertices=found.vertices.astype(np.float32), faces=found.faces.astype(np.uint32))
+        mesh = iso_surface(thinned)
+        surface = Surface(vertices=mesh.vertices.astype(np.float32), faces=mesh.faces.astype(np.uint32))
     except NotEvaluableError:
         surface = None
     unknown = None
@@ -94,18 +94,18 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
     """Robot of a replay, by its command line or log. Raises InputError for missing files."""
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
-    found = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
+    places = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
     if files["urdf"] is None and run.parts.has(run.path / ROBOT):
-        found["urdf"] = run.parts.checked(run.path / ROBOT)
+        places["urdf"] = run.parts.checked(run.path / ROBOT)
     refuse_if(
-        "urdf" not in found, f"{run.path}: its command line has no --urdf", remedy="replay with the command line"
+        "urdf" not in places, f"{run.path}: its command line has no --urdf", remedy="replay with the command line"
     )
     base = run.option("--base")
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
     pose = None if base is None else tuple(float(part) for part in base.split(","))
     robot = _robot(
-        found["urdf"], found.get("spheres"), pose, locks, packages, tuple(sha256(path) for path in found.values())
+        places["urdf"], places.get("spheres"), pose, locks, packages, tuple(sha256(path) for path in places.values())
     )
     return robot.moved_by(tuple(states.joints))
 
@@ -129,11 +129,11 @@ def robot_bodies(robot: RobotModel) -> dict[str, Surface]:
     return bodies_of(robot.surface)
 
 
-def _file(run: RunFolder, given: str, roots: tuple[Path, ...]) -> Path:
+def _file(run: RunFolder, word: str, roots: tuple[Path, ...]) -> Path:
     inputs: Mapping[str, Any] = run.run.get("inputs", {})
     return require(
-        run.place_of(given, roots, inputs.get(Path(given).name)),
-        f"{run.path}: {given} of its command line is not found, or was changed since",
+        run.place_of(word, roots, inputs.get(Path(word).name)),
+        f"{run.path}: {word} of its command line is not found, or was changed since",
         remedy="give the folder that it was relative to with --root",
     )
 
@@ -154,14 +154,14 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
     """Scene of a replay's command line. Raises InputError if missing."""
-    given = run.option("--scene")
-    folder = run.path / "scene" if given is None else run.place_of(given, roots)
-    found = require(
+    word = run.option("--scene")
+    folder = run.path / "scene" if word is None else run.place_of(word, roots)
+    scene_folder = require(
         folder if folder is not None and folder.exists() else None,
-        f"{run.path}: the scene {given or 'scene/'} of its command line is not found",
+        f"{run.path}: the scene {word or 'scene/'} of its command line is not found",
         remedy="give the folder that it was relative to with --root",
     )
-    return open_scene(found)
+    return open_scene(scene_folder)
 
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:

@@ -51,13 +51,13 @@ class RobotOptions:
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
     """Robot described by logs, or None. Raises InputError for several or an invalid one."""
-    found = logged_descriptions(paths)
+    robots = logged_descriptions(paths)
     refuse_if(
-        len(found) > 1,
-        f"{paths[0] if paths else ''}: {len(found)} robots, of {', '.join(where for _, where, _ in found)}",
+        len(robots) > 1,
+        f"{paths[0] if paths else ''}: {len(robots)} robots, of {', '.join(where for _, where, _ in robots)}",
         remedy="give one of them with --urdf",
     )
-    return _urdf(*found[0]) if found else None
+    return _urdf(*robots[0]) if robots else None
 
 
 def installed_urdf(name: str) -> Path:
@@ -66,14 +66,14 @@ def installed_urdf(name: str) -> Path:
     Raises UsageError if there is none, or several.
     """
     files = [file for package in distributions() for file in package.files or () if file.suffix == ".urdf"]
-    found = sorted({Path(str(file.locate())).resolve() for file in files if file.stem == name})
-    if len(found) == 1:
-        return found[0]
+    matches = sorted({Path(str(file.locate())).resolve() for file in files if file.stem == name})
+    if len(matches) == 1:
+        return matches[0]
     known = ", ".join(sorted({file.stem for file in files}))
     remedy = f"give one of: {known}" if known else "pip install example-robot-data, or give --urdf FILE"
     raise UsageError(
-        f"--robot {name}: expected one installed URDF of that name, got {len(found) or 'none'}",
-        remedy=f"give one with --urdf: {', '.join(map(str, found))}" if found else remedy,
+        f"--robot {name}: expected one installed URDF of that name, got {len(matches) or 'none'}",
+        remedy=f"give one with --urdf: {', '.join(map(str, matches))}" if matches else remedy,
     )
 
 
@@ -90,24 +90,24 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
     return file
 
 
-def add_self_model(model: RobotModel, given: Path | None, scene: Path | None = None) -> RobotModel:
+def add_self_model(model: RobotModel, file: Path | None, scene: Path | None = None) -> RobotModel:
     """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
     `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or another robot's.
     """
-    path = scene / SELF_MODEL if given is None and scene is not None else given
-    if path is None or path == NO_SELF_MODEL or (given is None and not path.is_file()):
+    path = scene / SELF_MODEL if file is None and scene is not None else file
+    if path is None or path == NO_SELF_MODEL or (file is None and not path.is_file()):
         return model
     faults, remedy = (*DAMAGE, OSError, TypeError, AttributeError), "write it with: splatctrl robot learn"
     with refuse_faults(f"{path}: not a self-model", *faults, remedy=remedy):
-        found = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
+        self_model = SelfModel.from_arrays(read_arrays(path, most=2**30))  # bytes
     try:
-        found.check_robot(model.surface, model.urdf.links, path)
+        self_model.check_robot(model.surface, model.urdf.links, path)
     except InputError:
-        if given is None:  # a replay reports a scene of another robot
+        if file is None:  # a replay reports a scene of another robot
             return model
         raise
-    return model.join_self_model(found)
+    return model.join_self_model(self_model)
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:

@@ -165,15 +165,15 @@ def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, An
     """Find links that may collide, and why others may not; also as a document."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ({}, []) if request.srdf is None else read_srdf(request.srdf, model.urdf)
-    found = self_collision_pairs(
+    pairs = self_collision_pairs(
         model, disabled, num_postures=request.postures, seed=request.seed, drop_never=request.drop_never
     )
-    return found, {
+    return pairs, {
         "urdf": str(request.urdf),
         "seed": request.seed,
         "num_foreign_pairs": len(foreign),
-        "num_sphere_pairs": len(found.pairs),
-        "num_postures": found.num_postures,
+        "num_sphere_pairs": len(pairs.pairs),
+        "num_postures": pairs.num_postures,
         "pairs": [
             {
                 "links": list(pair.links),
@@ -183,7 +183,7 @@ def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, An
                 "largest_gap": finite(pair.largest_gap),
                 "hit_share": finite(pair.hit_share),
             }
-            for pair in found.link_pairs
+            for pair in pairs.link_pairs
         ],
         "doubts": list(model.doubts),
     }

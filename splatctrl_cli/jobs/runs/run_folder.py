@@ -38,8 +38,8 @@ class States:
     @property
     def judged(self) -> Float64:
         """Clearance (T,) [m] to the splats, else the least of any measure."""
-        found = [self.clearance["exact"]] if "exact" in self.clearance else list(self.clearance.values())
-        return np.asarray(np.fmin.reduce([np.full(len(self.seconds), np.nan), *found]))
+        measures = [self.clearance["exact"]] if "exact" in self.clearance else list(self.clearance.values())
+        return np.asarray(np.fmin.reduce([np.full(len(self.seconds), np.nan), *measures]))
 
     def worst(self) -> int | None:
         """State of least judged clearance, None without values."""
@@ -79,13 +79,13 @@ class RunFolder:
 
     @property
     def arguments(self) -> list[str]:
-        given = list(self.words) or self.run.get("arguments", [])
-        return [str(word) for word in given] if isinstance(given, list) else []
+        words = list(self.words) or self.run.get("arguments", [])
+        return [str(word) for word in words] if isinstance(words, list) else []
 
     def options(self, name: str) -> list[str]:
         words = self.arguments
-        found = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
-        return found + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
+        values = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
+        return values + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
 
     def option(self, name: str) -> str | None:
         return next(iter(self.options(name)[::-1]), None)
@@ -99,8 +99,8 @@ class RunFolder:
             return json.loads(self.parts.checked(file).read_text(encoding="utf-8"))
 
     def pictures(self) -> list[Path]:
-        found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
-        return [self.parts.checked(path) for path in found if self.parts.has(path)]
+        files = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
+        return [self.parts.checked(path) for path in files if self.parts.has(path)]
 
     @cached_property
     def states(self) -> States | None:
@@ -111,14 +111,14 @@ class RunFolder:
         with refuse_faults(f"{file}: expected the columns of a replay", ValueError, KeyError, StopIteration):
             return _states(read_columns(self.parts.checked(file)))
 
-    def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
+    def place_of(self, word: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
         """Find a path of the command line: as typed, above the run, or below `roots`.
 
         None if missing, or of another `digest`.
         """
         above = [Path(), *self.path.absolute().parents, *roots]
-        found = [root / given for root in above if (root / given).exists()]
-        return next((path for path in found if digest is None or sha256(path) == digest), None)
+        places = [root / word for root in above if (root / word).exists()]
+        return next((path for path in places if digest is None or sha256(path) == digest), None)
 
 
 @dataclass(frozen=True, kw_only=True)

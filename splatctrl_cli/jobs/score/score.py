@@ -117,12 +117,12 @@ def _score_scene(request: ScoreRequest, folder: Path | None, progress: Progress)
             for (_, best), (_, worst) in scorer.extremes.values() if request.images != "none" else ():
                 comparison = [best] if worst.title == best.title else [best, worst]
                 comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
-        made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
+        splats = request.scene if request.scene.is_file() else request.scene / "splats.ply"
         _write_result(
             folder,
             result,
             config={"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol},
-            inputs={**digests, f"scene/{made.name}": sha256(made)},
+            inputs={**digests, f"scene/{splats.name}": sha256(splats)},
             stopwatch=stopwatch,
         )
     return result
@@ -249,13 +249,13 @@ def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
-    found = {path.name: path for path in sorted(folder.iterdir()) if (path / "splats.ply").is_file()}
-    if not found or recording.scan is None:
-        return found
+    scenes = {path.name: path for path in sorted(folder.iterdir()) if (path / "splats.ply").is_file()}
+    if not scenes or recording.scan is None:
+        return scenes
     wanted = [name.strip() for name in recording.scan.split(",") if name.strip()]
-    if unknown := [name for name in wanted if name not in found]:
-        raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(found)}")
-    return {name: found[name] for name in wanted}
+    if unknown := [name for name in wanted if name not in scenes]:
+        raise InputError(f"{folder}: no scene {unknown[0]!r}", remedy=f"scenes: {', '.join(scenes)}")
+    return {name: scenes[name] for name in wanted}
 
 
 def _score_scans(

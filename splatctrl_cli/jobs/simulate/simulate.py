@@ -291,15 +291,15 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
     if len(q) == model.num_joints:
         guesses.insert(0, np.clip(q, model.lower, model.upper))
     for nearer in fixed.SIMULATED_NEARER ** np.arange(fixed.SIMULATED_NEARINGS):
-        found = [
+        postures = [
             posture
             for pose in _turns(T_base_hand, nearer)
             for posture in goal_postures(
                 model, tip, pose, np.array(guesses), ControlConfig(), at_most=fixed.SIMULATED_POSTURES
             )
         ]
-        if found:
-            return np.array(found)
+        if postures:
+            return np.array(postures)
     raise InputError(
         f"{model.urdf.path}: expected {tip} to reach ({', '.join(f'{x:.2f}' for x in T_base_hand[:3, 3])}) m "
         "or nearer, pointing down, got no posture",

@@ -107,7 +107,7 @@ class Chain:
                 chosen["cameras"] = list(stage.cameras[: len(stage.cameras) - int(chosen["cameras"])])
             if "visitor" in chosen:
                 before = stage.options.get("visitor", VISITOR)
-                chosen["visitor"] = [values.get(name, given) for name, given in zip(PLACES, before, strict=True)]
+                chosen["visitor"] = [values.get(name, place) for name, place in zip(PLACES, before, strict=True)]
             jobs.append(replace(stage, matrix={option: [value] for option, value in chosen.items()}))
         return tuple(jobs)
 
@@ -149,10 +149,10 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
         stages.insert(0, _stage(before, command_line))
     if simulation is not None:
         stages = _add_simulation(simulation, stages, command_line)
-    made = {stage.command for stage in stages}
+    commands = {stage.command for stage in stages}
     for name, key in searched.items():
         refuse_if(
-            not made & key.options.keys(),
+            not commands & key.options.keys(),
             f"--over {name}: the run has no {' or '.join(key.options)} that it could change",
             remedy="sweep a replay with --scene or --lockstep",
             error=UsageError,
@@ -169,7 +169,7 @@ def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine)
 
 def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
     options = command_line.options_of(run.arguments)
-    found: list[Path] = []
+    stages: list[Path] = []
 
     def find_place(value: Any) -> Any:
         if isinstance(value, list):
@@ -181,13 +181,13 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
             f"{value}: is not there any more, and {run.path} was made from it",
             remedy="put it back, or make the run again and sweep that",
         ).absolute()
-        found.append(place)
+        stages.append(place)
         return str(place)
 
     options = {name: find_place(value) for name, value in options.items()}
     for recorded, digest in run.run.get("inputs", {}).items():
         name = recorded.removeprefix(CALIBRATION)
-        places = [p for at in found for p in (*((at,) if at.name == name else ()), at / name, at.parent / name)]
+        places = [p for at in stages for p in (*((at,) if at.name == name else ()), at / name, at.parent / name)]
         files = [file for file in places if file.is_file()]
         refuse_if(
             not recorded.startswith(PERTURB) and not any(sha256(file) == digest for file in files),
@@ -202,9 +202,9 @@ def _stage(run: RunFolder, command_line: CommandLine) -> Stage:
 
 def _simulation_of(replayed: Stage) -> RunFolder:
     folder = Path(replayed.options.get("truth", "")).parent
-    found = open_run(folder) if (folder / "run.json").is_file() else None
+    run = open_run(folder) if (folder / "run.json").is_file() else None
     return require(
-        found if found is not None and found.command == SIMULATE else None,
+        run if run is not None and run.command == SIMULATE else None,
         "--over obstacle-...: only of a simulated recording, by the folder that its --truth is in",
         remedy="make one with splatctrl simulate, and replay that with --truth DIR/truth.json",
         error=UsageError,
@@ -223,8 +223,8 @@ def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line
             remedy=f"replay {log}",
             error=UsageError,
         )
-    kept = dict.fromkeys(logs, f"{{{SIMULATE}}}/log.mcap") | {"truth": f"{{{SIMULATE}}}/truth.json"}
+    replaced = dict.fromkeys(logs, f"{{{SIMULATE}}}/log.mcap") | {"truth": f"{{{SIMULATE}}}/truth.json"}
     return [
         _stage(simulation, command_line),
-        *(replace(s, options={**s.options, **{k: kept[k] for k in kept if k in s.options}}) for s in stages),
+        *(replace(s, options={**s.options, **{k: replaced[k] for k in replaced if k in s.options}}) for s in stages),
     ]

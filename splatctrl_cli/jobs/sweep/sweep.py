@@ -255,9 +255,9 @@ class Runs:
     def at(self, points: Sequence[Mapping[str, float]]) -> list[Tried]:
         """Make the run at points, in parallel. Raises InputError if one fails."""
         new = {tuple(point.values()): point for point in points if tuple(point.values()) not in self.tried}
-        made = {values: self.nodes_at(point) for values, point in new.items()}
+        new_nodes = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
-        for node in (node for each in made.values() for node in each):
+        for node in (node for each in new_nodes.values() for node in each):
             refuse_if(
                 nodes.setdefault(node.name, self.nodes.get(node.name, node)).words != node.words,
                 f"two runs are called {node.name}",
@@ -265,11 +265,11 @@ class Runs:
                 error=UsageError,
             )
         assert self.scheduler is not None
-        found = self.scheduler.run(list(nodes.values())) if nodes else {}
+        runs = self.scheduler.run(list(nodes.values())) if nodes else {}
         self.nodes |= nodes
         self.keys |= self.scheduler.keys
-        for values, each in made.items():
-            self.tried[values] = self._read_tried(new[values], [found[node.name] for node in each])
+        for values, each in new_nodes.items():
+            self.tried[values] = self._read_tried(new[values], [runs[node.name] for node in each])
         return [self.tried[tuple(point.values())] for point in points]
 
     def _read_tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
@@ -315,7 +315,7 @@ def _vary_alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, 
         at.update(zip(values, runs.at([{**starts, name: value} for value in values]), strict=True))
         return [at[value].outcome for value in values]
 
-    found = find_flip(
+    flip = find_flip(
         judge,
         starts[name],
         end,
@@ -325,13 +325,13 @@ def _vary_alone(name: str, starts: Mapping[str, float], end: float, runs: Runs, 
     )
     return KeyFlip(
         key=key,
-        start=at[found.start],
-        end=at[found.end],
-        last=at.get(found.last),
-        first=at.get(found.first),
-        tried=[at[value] for value in found.tried],
-        is_monotone=found.is_monotone,
-        spacing=found.spacing,
+        start=at[flip.start],
+        end=at[flip.end],
+        last=at.get(flip.last),
+        first=at.get(flip.first),
+        tried=[at[value] for value in flip.tried],
+        is_monotone=flip.is_monotone,
+        spacing=flip.spacing,
     )
 
 
@@ -346,17 +346,17 @@ def _vary_together(
         a, b = ranges[flip.key.name]
         return None if flip.first is None else (flip.first.values[flip.key.name] - a) / (b - a)
 
-    found = find_least(
+    least = find_least(
         lambda points: [each.outcome for each in runs.at([values_at(point) for point in points])],
         [share(flip) for flip in flips],
         tolerance=tolerance,
     )
-    if found is None:
+    if least is None:
         return None
-    last, first = runs.at([values_at(found.last), values_at(found.first)])
-    return LeastChange(length=float(f"{found.length:.6g}"), last=last, first=first)
+    last, first = runs.at([values_at(least.last), values_at(least.first)])
+    return LeastChange(length=float(f"{least.length:.6g}"), last=last, first=first)
 
 
-def _write(out: Path, requested: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    document = {"format": FORMAT, "version": VERSION, "is_done": False, "asked": requested, **found}
+def _write(out: Path, requested: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
+    document = {"format": FORMAT, "version": VERSION, "is_done": False, "asked": requested, **answer}
     write_durably(out / FILE, lambda path: write_json(path, document))

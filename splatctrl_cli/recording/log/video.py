@@ -189,14 +189,14 @@ class VideoFileLog(RawLog):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        beside = require(
+        folder = require(
             next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None),
             f"{path}: expected a file of stamps next to it, got none",
             remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
             + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),
         )
         self._av = import_extra(LIBRARY, EXTRA, "video files")
-        self.files, self._stamps = (path, beside), _read_stamps(beside)
+        self.files, self._stamps = (path, folder), _read_stamps(folder)
         self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
