@@ -1,7 +1,7 @@
 """Scores of rendered against recorded views, and what follows from them.
 
-Over all pixels and those seen in training.
-A report is ``score.json``: ``metrics`` by flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
+A score covers all pixels and, apart, those seen in training. A report is ``score.json``: ``metrics`` by
+flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
 """
 
 import json

@@ -104,10 +104,7 @@ def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) 
     if file is None and options.spheres is not None:  # without spheres it is often unusable
         file = logged_urdf(paths)
     if file is None:
-        for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
-            refuse_if(
-                getattr(options, name), f"--{option}: needs the robot", remedy="give --urdf as well", error=UsageError
-            )
+        options.refuse_without_robot()
         return None
     return options.posed(file, own_spheres(file))
 

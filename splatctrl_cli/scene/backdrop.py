@@ -1,6 +1,6 @@
-"""Splats for rendering only: at pixels without depth, and beyond the workspace.
+"""Splats for rendering only: the backdrop and the shell.
 
-The backdrop is of the former, the shell of the latter; the shell is coarse, and has its own budget.
+The backdrop fills pixels without depth. The shell lies beyond the workspace, coarse, with its own budget.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -28,6 +28,7 @@ from tests.refused import expect_refusal
 
 QUICK = ("scene.max_splats=800", "scene.first_iterations=10", "scene.iterations_per_step=1")
 ALL = ("check", "scene", "replay", "report")
+BASE = (0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0)
 
 
 def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
@@ -125,6 +126,9 @@ def test_a_second_call_makes_only_what_its_changes_decide(desk: Desk) -> None:
     assert desk.steps_made(goal_joints=(0.5,) * 7) == ("closed_loop", "report")
     assert desk.steps_made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
     assert desk.steps_made(seed=1) == ("scene", "replay", "report")
+    assert desk.steps_made(seed=1, base=BASE) == ALL
+    assert desk.steps_made(seed=1, base=BASE, locked={"joint1": 0.1}) == ALL
+    assert desk.steps_made(seed=1) == ALL
     assert desk.steps_made(seed=1, force=True) == ALL
 
 
@@ -132,11 +136,13 @@ def test_options_reach_every_step(desk: Desk) -> None:
     options = SourceOptions(cameras=("cam1",))
     given = {"options": options, "config": load_config(None, ["control.margin=0.03"]), "seed": 3, "threads": 2}
     pose = (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
-    desk.steps_made(**given, device="cpu", resume=True, goal=pose, frame="hand")
+    robot = {"base": BASE, "locked": {"joint1": 0.1}, "packages": (Path("meshes"),)}
+    desk.steps_made(**given, **robot, device="cpu", resume=True, goal=pose, frame="hand")
     scene, replay, driven = (desk.requests[name] for name in ("scene", "replay", "closed_loop"))
     for each in (scene, replay, driven):
         assert (each.config, each.seed, each.threads, each.device) == (given["config"], 3, 2, "cpu")
         assert (each.urdf, each.spheres) == (desk.request.urdf, desk.request.spheres)
+        assert {name: getattr(each, name) for name in robot} == robot
     assert scene.resume and replay.options == driven.options == options
     assert replay.scene == driven.scene == desk.request.out / "scene"
     assert (replay.mode, replay.goal, replay.frame) == ("audit", None, None)

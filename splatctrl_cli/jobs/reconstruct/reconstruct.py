@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli.calibration.displacement import correct_pose, displaced_cameras
 from splatctrl_cli.calibration.evidence import Arm
 from splatctrl_cli.config.fixed import STATES_CLOSE_NS
-from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
+from splatctrl_cli.errors import InputError, refuse_if, require
 from splatctrl_cli.evaluate.verdict import JudgedResult, check_gate_names, plural
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.formats.arrays import savez
@@ -21,7 +21,14 @@ from splatctrl_cli.jobs.calibrate import depth_frame, frames_nearest, stamps_by_
 from splatctrl_cli.jobs.reconstruct.reconstruction import Reconstruction, ReconstructRequest, training_cameras
 from splatctrl_cli.jobs.reconstruct.verdict import GATED, reconstruct_verdict
 from splatctrl_cli.jobs.recordings.open_recording import guessed_unit
-from splatctrl_cli.jobs.robot.logged_robot import NO_SELF_MODEL, RobotOptions, add_self_model, other_frame, urdf_of
+from splatctrl_cli.jobs.robot.logged_robot import (
+    GIVE_ROBOT,
+    NO_SELF_MODEL,
+    RobotOptions,
+    add_self_model,
+    other_frame,
+    urdf_of,
+)
 from splatctrl_cli.jobs.running.device import (
     FitDevice,
     advise_resumption,
@@ -147,20 +154,15 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
     """Read declarations, none without a file. Raises UsageError without a robot."""
     if path is None:
         return Declarations()
-    robot = require(robot, f"--declare {path}: needs the robot", remedy="give --urdf as well", error=UsageError)
+    robot = require(robot, f"--declare {path}: needs the robot", **GIVE_ROBOT)
     return read_declarations(path, robot.frame_names)
 
 
 def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None:
     urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
     if urdf is None:
-        for option, path in (("spheres", request.spheres), ("self-model", request.self_model)):
-            refuse_if(
-                path not in (None, NO_SELF_MODEL),
-                f"--{option} {path}: needs the robot",
-                remedy="give --urdf as well",
-                error=UsageError,
-            )
+        request.refuse_without_robot()
+        refuse_if(request.self_model not in (None, NO_SELF_MODEL), "--self-model: needs the robot", **GIVE_ROBOT)
         return None
     refuse_if(
         guess := guessed_unit(request.source),

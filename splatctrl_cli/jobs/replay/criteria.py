@@ -112,8 +112,8 @@ class Bound:
         value = worst.value
         words = {
             **{"value": value, "negated": -value, "mm": mm(value), "ms": 1e3 * value, "percent": 100 * value},
-            **{"allowed": allowed, "allowed_mm": mm(allowed), "allowed_percent": 100 * allowed},
-            **{"who": worst.who, "words": worst.sentence},
+            **{"allowed": allowed, "allowed_mm": mm(allowed), "allowed_ms": 1e3 * allowed},
+            **{"allowed_percent": 100 * allowed, "who": worst.who, "words": worst.sentence},
         }
         if self.breaks(value, allowed, tolerance):
             yield replace(

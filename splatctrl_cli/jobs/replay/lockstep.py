@@ -161,7 +161,8 @@ class Lockstep:
     """Frame sets still to come, and stamps and files of the maps so far.
 
     ends_with_log: known space is of the whole log, else of the frame sets passed. is_real_time: a map but the
-    first is known when this machine has computed it; of the frame sets that come meanwhile only the newest waits.
+    first is known when this machine has computed it (its known space, when it begins); of the frame sets that come
+    meanwhile only the newest waits.
     held_out_every: one in so many is evidence and left out.
     """
 
@@ -191,7 +192,7 @@ class Lockstep:
 
     def scene(self) -> KnownScene:
         """Return the scene of a replay; take frame sets up to the first map now."""
-        while self._next is not None and (self._is_real_time or not self._stamps_ns):
+        while self._next is not None and not self._stamps_ns:
             self._take()
         self._fitted.check_found()
 

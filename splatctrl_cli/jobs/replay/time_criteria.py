@@ -201,7 +201,7 @@ CLOCKS = Bound(
     at_most=CLOCKS_APART,
     tolerance=attrgetter("logged.clock.uncertainty_s"),
     unit="s",
-    say="the cameras' clock is {ms:.0f} ms {words}, allowed {allowed:g} s",
+    say="the cameras' clock is {ms:.0f} ms {words}, allowed {allowed_ms:.0f} ms",
     passed="{ms:.0f} ms apart",
     remedy="synchronise the clocks, or shift one in the log",
 )

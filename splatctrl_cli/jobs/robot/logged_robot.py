@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError, refuse_faults, refuse_if
 from splatctrl_cli.formats.arrays import DAMAGE, read_arrays
@@ -21,6 +22,7 @@ from splatctrl_cli.robot.self_model import SelfModel
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 NO_SELF_MODEL = Path("none")  # as --self-model: neither learned nor taken from the scene
+GIVE_ROBOT: Mapping[str, Any] = {"remedy": "give --urdf as well", "error": UsageError}
 TAKE = "leave --urdf out to take the log's own, or correct the file"
 
 
@@ -47,6 +49,11 @@ class RobotOptions:
             locked=self.locked,
             packages=self.packages,
         )
+
+    def refuse_without_robot(self) -> None:
+        """Raise UsageError for an option given where there is no robot."""
+        for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
+            refuse_if(getattr(self, name), f"--{option}: needs the robot", **GIVE_ROBOT)
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:

@@ -216,10 +216,10 @@ def test_in_real_time_a_map_is_known_when_it_is_computed_and_the_newest_frame_se
     scene = opened(small_recording, tmp_path, arm, latency=0.0, is_real_time=True)
     first = scene.stamps_ns[0]
     assert scene.first_ns == first  # a live run begins with a map
-    for tenths in range(1, 30):
-        now_ns = first + tenths * SECOND // 10
-        assert len(scene.stamps_ns) >= sum(known <= now_ns for known in scene.known_ns)
-        scene.advance(now_ns)
+    starts = [0.0, *(0.2 * number + delay - seconds for number, delay in zip(used[1:], delays[1:], strict=True))]
+    for past in np.arange(0.01, 3, 0.1):
+        scene.advance(first + round(past * SECOND))
+        assert len(scene.stamps_ns) == sum(start <= past for start in starts), "the future is not computed"
     np.testing.assert_allclose(np.subtract(scene.stamps_ns, first) / SECOND, 0.2 * np.array(used), atol=1e-3)
     np.testing.assert_allclose(np.subtract(scene.known_ns, scene.stamps_ns) / SECOND, delays, atol=1e-3)
     assert scene.figures()["num_dropped_sets"] == 5 - len(used)

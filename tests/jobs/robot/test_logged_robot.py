@@ -114,6 +114,24 @@ def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given
         assert open_log(request)[0].joint_names == names
 
 
+@pytest.mark.parametrize(
+    ("option", "given"),
+    [
+        ("base", {"base": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}),
+        ("lock", {"locked": {"joint_a": 0.0}}),
+        ("packages", {"packages": (Path("meshes"),)}),
+        ("spheres", {"spheres": Path("s.yaml")}),
+        ("self-model", {"self_model": Path("self.npz")}),
+    ],
+)
+def test_an_option_of_the_robot_without_one_is_refused(option: str, given: dict[str, Any], tmp_path: Path) -> None:
+    path = log_with(tmp_path / "run.mcap")
+    request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path)
+    assert _robot(request, Said()) is None
+    words = f"^--{option}: needs the robot; give --urdf as well"
+    expect_refusal(words, _robot, replace(request, **given), Said(), error=UsageError)
+
+
 def test_a_log_that_does_not_exist_is_named_before_its_robot(tmp_path: Path) -> None:
     request = ReplayRequest(log=tmp_path / "none.mcap", out=tmp_path / "out")
     expect_refusal("none.mcap: no such file or folder; check the path", open_log, request)

@@ -28,7 +28,7 @@ def error(got: Float32, want: Float32) -> float:
 
 
 def derivatives(fit: DeviceFit, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
-    """Of the first view's loss by the parameters (N, 8), which stay, and the loss."""
+    """Gradient (N, 8) of the first view's loss by the parameters, which do not change, and the loss."""
     height, width = fit.views[0].target.depth.shape
     while True:
         fit.rewind([0], weights, settings, 0)
