@@ -22,8 +22,9 @@ SEEN = np.ones(400, np.bool_)
 def test_two_planes_are_as_far_apart_both_ways() -> None:
     """The completeness of seen surface is NaN if nothing was seen."""
     score = cloud_score(plane(0.003), plane(0.0), SEEN)
-    near = ("accuracy", "completeness", "completeness_seen", "chamfer")
-    assert [score[name] for name in near] == pytest.approx([0.003] * 4)
+    assert [score[name] for name in ("accuracy", "completeness", "completeness_seen", "chamfer")] == pytest.approx(
+        [0.003] * 4
+    )
     assert score["accuracy_beyond"] == score["completeness_beyond"] == 0.0
     assert math.isnan(cloud_score(plane(0.0), plane(0.0), ~SEEN)["completeness_seen"])
 
@@ -61,8 +62,7 @@ def test_a_cloud_that_would_fit_in_another_unit_is_refused_with_that_unit(factor
 def test_points_that_do_not_count_enter_no_accuracy_but_complete_the_surface() -> None:
     points, counts = np.vstack([plane(0.003), plane(0.0)]), np.repeat([True, False], 400)
     score = cloud_score(points, plane(0.0), SEEN, counts=counts)
-    figures = score["accuracy"], score["completeness"], score["num_points"]
-    assert figures == (pytest.approx(0.003), 0.0, 400)
+    assert (score["accuracy"], score["completeness"], score["num_points"]) == (pytest.approx(0.003), 0.0, 400)
     with pytest.raises(NotEvaluableError, match="the scene's surface: expected points to compare, got none"):
         cloud_score(points, plane(0.0), SEEN, counts=counts & False)
 
@@ -73,8 +73,7 @@ def test_spaced_points_are_what_taking_them_in_turn_leaves() -> None:
     for point in some[np.random.default_rng(0).permutation(len(some))]:
         if np.all(np.linalg.norm(kept - point, axis=1) > spacing):
             kept = np.vstack([kept, point])
-    assert 50 < len(kept) < 0.6 * len(some)
-    assert np.array_equal(space_out(points, spacing), kept)
+    assert 50 < len(kept) < 0.6 * len(some) and np.array_equal(space_out(points, spacing), kept)
     assert sorted(space_out(kept, spacing).tolist()) == sorted(kept.tolist()), "what is spaced stays as it is"
     assert len(space_out(np.empty((0, 3)), spacing)) == 0
 
@@ -84,8 +83,9 @@ def test_rigid_motion_changes_no_figure() -> None:
     points, reference = rng.uniform(0, 0.03, (200, 3)), rng.uniform(0, 0.03, (300, 3))
     Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     seen = rng.random(300) < 0.5
-    other = cloud_score(points @ Q.T + 0.4, reference @ Q.T + 0.4, seen)
-    assert cloud_score(points, reference, seen) == pytest.approx(other, abs=1e-12)
+    assert cloud_score(points, reference, seen) == pytest.approx(
+        cloud_score(points @ Q.T + 0.4, reference @ Q.T + 0.4, seen), abs=1e-12
+    )
 
 
 def test_thinning_leaves_one_point_to_a_cube() -> None:
@@ -100,8 +100,9 @@ def test_thinning_leaves_one_point_to_a_cube() -> None:
 
 def test_points_on_a_mesh_lie_on_it_evenly() -> None:
     vertices = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.1, 0.1, 0.5], [0.0, 0.1, 0.5]])
-    mesh = TriangleMesh(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]]), is_closed=False)
-    points = points_on(mesh, 0.002)
+    points = points_on(
+        TriangleMesh(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]]), is_closed=False), 0.002
+    )
     assert len(points) == pytest.approx(4 * 0.01 / 0.002**2, abs=1)
     np.testing.assert_allclose(points[:, 2], 0.5)
     assert points[:, :2].min() >= 0 and points[:, :2].max() <= 0.1 and abs(points[:, 0].mean() - 0.05) < 0.002

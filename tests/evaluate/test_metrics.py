@@ -85,15 +85,17 @@ STAMPS = np.arange(6, dtype=np.int64) * 10
 
 def agreement(clearance: list[float], truth: list[float], seen: list[bool]) -> list[float | None]:
     found = clearance_agreement(np.array(clearance), np.array(truth), np.array(seen), 0.005)
-    names = "num_compared", "median", "largest", "largest_over", "tolerance", "share_within"
-    return [found[name] for name in names]
+    return [
+        found[name] for name in ("num_compared", "median", "largest", "largest_over", "tolerance", "share_within")
+    ]
 
 
 def test_agreement_takes_near_and_seen_states_only() -> None:
     """An under-estimate is no over-estimate, and without a state to compare there is no figure."""
     truth, seen = [0.05, 0.05, 0.05, 0.05, 0.10, 0.09], [True, True, True, False, True, True]
-    found = agreement([0.04, 0.07, 0.05, 0.9, 0.9, np.nan], truth, seen)
-    assert found == pytest.approx([3, 0.01, 0.02, 0.02, 0.015, 2 / 3])
+    assert agreement([0.04, 0.07, 0.05, 0.9, 0.9, np.nan], truth, seen) == pytest.approx(
+        [3, 0.01, 0.02, 0.02, 0.015, 2 / 3]
+    )
     assert agreement([0.01], [0.05], [True])[3::2] == [0.0, 0.0]
     assert agreement([1.0, 1.0], [1.0, 1.0], [True, True])[::5] == [0, None]
 
@@ -115,14 +117,14 @@ def test_a_frame_shows_a_surface_to_later_states_only(monkeypatch: pytest.Monkey
 @given(scores=st.lists(st.integers(-5, 20).map(float), min_size=1, max_size=40), percent=st.integers(50, 99))
 def test_the_rank_is_that_of_the_definition(scores: list[float], percent: int) -> None:
     rank = conformal_rank(len(scores), percent / 100)
-    expected = reference.quantile(scores, Fraction(percent, 100))
-    assert (sorted(scores)[rank - 1] if rank <= len(scores) else None) == expected
+    assert (sorted(scores)[rank - 1] if rank <= len(scores) else None) == reference.quantile(
+        scores, Fraction(percent, 100)
+    )
 
 
 @pytest.mark.parametrize("num", [2, 3, 9, 19, 98, 99, 100, 1000])
 def test_the_highest_confidence_of_n_scores_takes_the_largest(num: int) -> None:
-    assert conformal_rank(num, num / (num + 1)) == num
-    assert conformal_rank(num, (num + 0.01) / (num + 1)) == num + 1
+    assert (conformal_rank(num, num / (num + 1)), conformal_rank(num, (num + 0.01) / (num + 1))) == (num, num + 1)
 
 
 @few(100)
@@ -203,8 +205,7 @@ def test_a_further_stretch_of_a_slow_series_is_covered_as_promised(share: float)
     num_sets, covered, promised = 150, [], []
     for row in correlated(rng, (600, 4 * num_sets), share):
         bound = conformal_bound(row[:num_sets], 0.9)
-        later = row[num_sets + 100 :][: bound.length]
-        covered.append(later.max() <= bound.bound)
+        covered.append(row[num_sets + 100 :][: bound.length].max() <= bound.bound)
         promised.append(bound.confidence)
     assert np.mean(covered) >= np.mean(promised) - 3.5 * np.sqrt(0.09 / 600)
 

@@ -113,8 +113,7 @@ def test_a_point_counts_where_its_nearest_cell_was_observed(tmp_path: Path) -> N
     points, expected = rng.uniform(LOW - 15, HIGH + 15, (4000, 3)), []  # [mm]
     for point in points:
         cell = tuple(round(float(x)) for x in (point - LOW) / RESOLUTION)
-        inside = all(0 <= c < n for c, n in zip(cell, mask.shape, strict=True))
-        expected.append(bool(inside and mask[cell]))
+        expected.append(bool(all(0 <= c < n for c, n in zip(cell, mask.shape, strict=True)) and mask[cell]))
     assert 300 < sum(expected) < 3000 and space.observed(points / 1000).tolist() == expected
     near = ((points >= LOW - 60) & (points < HIGH + 120)).all(axis=1)
     assert space.near(points / 1000).tolist() == near.tolist()
@@ -155,7 +154,9 @@ def write_observed(folder: Path, number: int, low: Float64, high: Float64, is_ob
     """The files of a scan: a box [mm], observed everywhere unless said otherwise, the ground half way up in z."""
     shape = tuple(int(n) for n in np.ceil((high - low) / RESOLUTION))
     mask = np.ones(shape, np.uint8) if is_observed is None else is_observed.astype(np.uint8)
-    variables = {"ObsMask": mask, "BB": np.vstack([low, high]), "Res": RESOLUTION}
-    savemat(folder / f"ObsMask{number}_10.mat", variables, do_compression=True)
-    plane = np.array([[0.0], [0.0], [1.0], [-0.5 * (low[2] + high[2])]])
-    savemat(folder / f"Plane{number}.mat", {"P": plane})
+    savemat(
+        folder / f"ObsMask{number}_10.mat",
+        {"ObsMask": mask, "BB": np.vstack([low, high]), "Res": RESOLUTION},
+        do_compression=True,
+    )
+    savemat(folder / f"Plane{number}.mat", {"P": np.array([[0.0], [0.0], [1.0], [-0.5 * (low[2] + high[2])]])})

@@ -35,8 +35,13 @@ ONES = np.ones((H, W), np.float32)
 def photo() -> RgbdFrame:
     color = np.random.default_rng(0).integers(51, 153, (H, W, 3))
     depth = np.broadcast_to((np.arange(H) >= 5)[:, None], (H, W))
-    lens = Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H)
-    return plain_frame(depth, lens, stamp_ns=7, camera="cam3", color=color)
+    return plain_frame(
+        depth,
+        Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H),
+        stamp_ns=7,
+        camera="cam3",
+        color=color,
+    )
 
 
 def perfect(offset: float = 0.0) -> Float32:
@@ -51,8 +56,14 @@ def score(
 
 def masked_score() -> dict[str, float]:
     """Right under the mask (the left half), 0.1 off elsewhere."""
-    color = np.where(LEFT[..., None], perfect(0.01), perfect(0.1))
-    return score_view(color=color, depth=ONES, frame=photo(), seen=NONE, mask=LEFT, fill=1.0)
+    return score_view(
+        color=np.where(LEFT[..., None], perfect(0.01), perfect(0.1)),
+        depth=ONES,
+        frame=photo(),
+        seen=NONE,
+        mask=LEFT,
+        fill=1.0,
+    )
 
 
 def test_a_mask_is_a_region_of_its_own() -> None:
@@ -76,13 +87,11 @@ def test_what_the_lens_did_not_see_is_in_no_region() -> None:
 
 def test_regions_are_scored_apart_and_none_is_zero_filled() -> None:
     color = np.where(LEFT[..., None], perfect(0.1), perfect(0.2))
-    depth = np.where(LEFT, np.float32(1.004), np.float32(1.03))
-    result = score(color, depth, LEFT & (photo().depth > 0))
+    result = score(color, np.where(LEFT, np.float32(1.004), np.float32(1.03)), LEFT & (photo().depth > 0))
     assert result["psnr_seen"] == pytest.approx(20.0, abs=1e-3)
     assert result["psnr_all"] == pytest.approx(-10 * math.log10((0.01 + 0.04) / 2), abs=1e-3)
     assert (result["depth_median_seen"], result["depth_mean_all"]) == pytest.approx((0.004, 0.017), abs=1e-6)
-    assert result["depth_within_1cm_all"] == 0.5
-    assert (result["valid_share"], result["seen_share"]) == (0.75, 0.375)
+    assert (result["depth_within_1cm_all"], result["valid_share"], result["seen_share"]) == (0.5, 0.75, 0.375)
 
 
 def test_pixels_without_reference_depth_count_for_colour_but_not_for_depth() -> None:
@@ -100,8 +109,9 @@ def test_holes_in_the_render_lower_the_depth_coverage_and_nothing_else_of_depth(
 
 
 def test_a_render_beyond_0_to_1_is_scored_as_a_screen_shows_it() -> None:
-    white = replace(photo(), color=np.full((H, W, 3), 255, np.uint8))
-    result = score(np.full((H, W, 3), 1.5, np.float32), frame=white)
+    result = score(
+        np.full((H, W, 3), 1.5, np.float32), frame=replace(photo(), color=np.full((H, W, 3), 255, np.uint8))
+    )
     assert (result["psnr_all"], result["ssim_all"]) == (math.inf, pytest.approx(1.0))
 
 
@@ -123,8 +133,9 @@ def test_totals_are_means_over_views() -> None:
 def test_the_names_of_the_totals_are_known_beforehand() -> None:
     view = masked_score()
     assert set(metric_scales()) >= set(total_score([score(perfect())]))
-    corrected = {f"{name}{CORRECTED}" for name in view if name in CORRECTABLE}
-    assert set(metric_scales()) == set(total_score([view])) | corrected
+    assert set(metric_scales()) == set(total_score([view])) | {
+        f"{name}{CORRECTED}" for name in view if name in CORRECTABLE
+    }
     assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
 
 
@@ -220,8 +231,9 @@ def test_a_mask_without_a_pixel_is_refused_with_the_view() -> None:
 
 
 def test_a_view_that_stands_where_one_trained_is_named_unless_that_is_meant() -> None:
-    line = lines_of(Doubts(is_still=True), (0, 8))
-    assert line.startswith("holdout-0008 stands 0.0 mm and 0.00 degrees from a training view: a view that trained")
+    assert lines_of(Doubts(is_still=True), (0, 8)).startswith(
+        "holdout-0008 stands 0.0 mm and 0.00 degrees from a training view: a view that trained"
+    )
     assert lines_of(Doubts(is_still=True, may_train=True), (0, 8)) == ""
 
 

@@ -168,8 +168,9 @@ def test_a_name_that_is_not_known_is_refused_with_the_nearest(name: str, words: 
     """Or with the mode whose figure it is."""
     elsewhere = {"--mode audit": ("min_clearance",), "--mode closed-loop": ("min_clearance", "goal_reached")}
     check_gate_names(["min_clearance>=1"], ("min_clearance", "unknown_share"), elsewhere)
-    known = ("min_clearance", "unknown_share")
-    expect_refusal(words, check_gate_names, [f"{name}>=0"], known, elsewhere, error=UsageError)
+    expect_refusal(
+        words, check_gate_names, [f"{name}>=0"], ("min_clearance", "unknown_share"), elsewhere, error=UsageError
+    )
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,9 @@ from tests.reference.images import ssim_at
 
 
 def frame(stamp_ns: int, camera: str) -> RgbdFrame:
-    lens = Intrinsics(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=2, height=2)
-    return plain_frame(1.0, lens, stamp_ns=stamp_ns, camera=camera)
+    return plain_frame(
+        1.0, Intrinsics(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=2, height=2), stamp_ns=stamp_ns, camera=camera
+    )
 
 
 class FakeSource:
@@ -86,8 +87,7 @@ def test_a_log_is_scored_at_the_poses_that_its_scene_was_trained_at() -> None:
         corrected=lambda frame: replace(frame, T_world_camera=2.0 * np.eye(4)),
     )
     frames = [frame for view in views for frame in (view.frame, *view.training)]
-    assert len(frames) == 3 + 2
-    assert all(np.array_equal(frame.T_world_camera, 2.0 * np.eye(4)) for frame in frames)
+    assert len(frames) == 3 + 2 and all(np.array_equal(frame.T_world_camera, 2.0 * np.eye(4)) for frame in frames)
 
 
 def test_stamps_that_number_the_views_name_them() -> None:
@@ -178,8 +178,9 @@ def test_ssim_map_equals_the_reference_window_by_window_and_at_the_border() -> N
     x, y = noise(3), np.clip(noise(3) + 0.2 * noise(4), 0, 1)
     similarity = ssim_map(x, y)
     for row, column, channel in itertools.product((0, 12, 23), (0, 15, 30), range(3)):
-        expected = ssim_at(x[..., channel], y[..., channel], row, column)
-        assert similarity[row, column, channel] == pytest.approx(expected, abs=1e-12)
+        assert similarity[row, column, channel] == pytest.approx(
+            ssim_at(x[..., channel], y[..., channel], row, column), abs=1e-12
+        )
 
 
 def test_depth_errors_count_only_pixels_where_both_have_depth() -> None:

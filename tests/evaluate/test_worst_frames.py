@@ -27,8 +27,9 @@ MOMENT = Moment(
 
 def frame(stamp_ns: int, camera: str = "near", *, away: float = 1.0, depth: float = 0.0, x: float = 0.0) -> RgbdFrame:
     """A camera that looks along world z from `away` before the origin; a grey image of its stamp in tenths."""
-    T = pose_at([x, 0.0, -away])
-    return plain_frame(depth, LENS, T, stamp_ns=stamp_ns, camera=camera, color=stamp_ns * 10 // SECOND)
+    return plain_frame(
+        depth, LENS, pose_at([x, 0.0, -away]), stamp_ns=stamp_ns, camera=camera, color=stamp_ns * 10 // SECOND
+    )
 
 
 @pytest.mark.parametrize("num", [0, 1, 2, 3, 9])

@@ -48,8 +48,9 @@ def test_the_bound_holds_for_parts_and_halls_and_far_from_the_origin(scale: floa
     centers = (scale * centers + shift).astype(np.float32).astype(np.float64)
     radii = (scale * radii).astype(np.float32).astype(np.float64)
     box = Box(lower=np.full(3, shift - 1.2 * scale), upper=np.full(3, shift + 1.2 * scale))
-    grid = bake(splat_set(centers, radii), box, FieldConfig(voxel=0.05 * scale))
-    excess = judge("scaled", grid, centers, radii, 4 * NUM).excess
+    excess = judge(
+        "scaled", bake(splat_set(centers, radii), box, FieldConfig(voxel=0.05 * scale)), centers, radii, 4 * NUM
+    ).excess
     for promise in ("bound_at_cell", "bound_nearest_cell", "bound_interpolated", "certified"):
         assert excess[promise][0] == 0, (promise, excess[promise])
     assert excess["certified"][1] > -2e-3 * scale
@@ -75,12 +76,10 @@ def assert_holds(verdict: Verdict) -> None:
 )
 def test_what_is_above_the_exact_distance_is_found_out(promise: str, share: float) -> None:
     grid, centers, radii = balls_grid()
-    margin = share * np.float32(grid.header["bound_margin"])
-    grid.channels["bound"] = grid.channels["bound"] + np.float32(margin)
+    grid.channels["bound"] = grid.channels["bound"] + np.float32(share * np.float32(grid.header["bound_margin"]))
     grid.channels["sdf"] = grid.channels["sdf"] + np.float32(0.0 if share else 1e-5)
     verdict = judge("doctored", grid, centers, radii, NUM)
-    assert not verdict.holds
-    assert verdict.excess[promise][0] > 0
+    assert not verdict.holds and verdict.excess[promise][0] > 0
 
 
 def balls_grid() -> tuple[DistanceGrid, Float64, Float64]:
@@ -116,8 +115,9 @@ def test_cells_that_lose_more_than_allowed_are_refused_with_the_largest_that_do_
 def test_safe_at_a_cell_is_never_above_the_exact_distance(distance: str) -> None:
     centers, radii = lone_splat(0.02, wall_spacing=0.01, radius=0.004)
     config = replace(FieldConfig(voxel=0.02), distance=distance)
-    box = Box(lower=np.array([-0.1, -0.2, -0.2]), upper=np.array([0.25, 0.2, 0.2]))
-    grid = bake(splat_set(centers, radii), box, config)
+    grid = bake(
+        splat_set(centers, radii), Box(lower=np.array([-0.1, -0.2, -0.2]), upper=np.array([0.25, 0.2, 0.2])), config
+    )
     assert judge("lone", grid, centers, radii, NUM).excess["sdf_at_cell"][0] == 0
 
 
@@ -134,8 +134,7 @@ def test_safe_reads_no_clearance_that_a_lone_splat_takes(case: LoneSplat) -> Non
         alone = kernel.query(points)[0]
         assert (alone - hard).max() > 2e-3  # the kernel alone reads clearance that is not there
         safe = SafeField(exact, kernel).query(points)[0]
-        assert (safe <= exact.query(points)[0]).all()
-        assert (safe <= hard + 1e-6).all()
+        assert (safe <= exact.query(points)[0]).all() and (safe <= hard + 1e-6).all()
 
 
 def before_the_splat(radius: float) -> Float64:
@@ -161,16 +160,16 @@ def test_safe_is_within_a_millimetre_and_a_third_of_the_spacing(shape: Shape) ->
         assert row.whole.count == NUM_NEAR
         assert row.is_kept, (row.shape, row.spacing, row.is_inset, row.whole.rmse)
         assert row.whole.over_max < row.spacing
-    far = [row.bands[-1].mean for row in rows if row.field == "gpdf"]
-    assert all(mean is not None and mean < -0.01 for mean in far)
+    assert all(
+        mean is not None and mean < -0.01 for mean in [row.bands[-1].mean for row in rows if row.field == "gpdf"]
+    )
 
 
 @pytest.mark.parametrize("shape", shapes(with_meshes=False), ids=lambda shape: shape.name)
 def test_balls_inside_a_solid_read_no_less_than_the_distance_to_it(shape: Shape) -> None:
     points, truth = points_around(shape, NUM_NEAR, *BAND, seed=3)
     np.testing.assert_allclose(shape.signed(points), truth, atol=0)
-    assert truth.min() >= BAND[0]
-    assert truth.max() < BAND[1]
+    assert truth.min() >= BAND[0] and truth.max() < BAND[1]
     hard = SphereField(Spheres.of(*splats_on(shape, 0.02, is_inset=True, seed=0))).query(points)[0]
     assert (hard - truth).min() > -2.1e-4  # the tolerance of inscribed balls
     assert (hard - truth).max() < 0.02

@@ -54,10 +54,10 @@ def test_gpdf_is_the_log_sum_exp_of_the_paper_and_errs_upwards_by_no_more_than_i
     expected = reference.gpdf(queries(), centers, radii, LENGTH, NOISE)
     slope = reference.gpdf_gradient(queries(), centers, radii, LENGTH, NOISE)
     for truncation in (2e-4, 2e-5, 2e-6):
-        config = FieldConfig(length_scale=LENGTH, truncation=truncation)
-        distance, gradient = GpdfField(Spheres.of(centers, radii), config).query(queries())
-        assert (distance - expected).min() > -3e-7
-        assert (distance - expected).max() < truncation + 3e-7
+        distance, gradient = GpdfField(
+            Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, truncation=truncation)
+        ).query(queries())
+        assert (distance - expected).min() > -3e-7 and (distance - expected).max() < truncation + 3e-7
         if truncation <= FieldConfig.truncation:
             np.testing.assert_allclose(gradient, slope, atol=2e-3)
 
@@ -112,8 +112,7 @@ def test_safe_field_never_exceeds_the_exact_distance() -> None:
         GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH)).query(points)[0],
     )
     safe, gradient = field_over(Spheres.of(centers, radii), FieldConfig(distance="safe_gpdf")).query(points)
-    assert (kernel > hard + 1e-3).any()
-    assert (safe <= hard).all()
+    assert (kernel > hard + 1e-3).any() and (safe <= hard).all()
     np.testing.assert_array_equal(safe, np.minimum(hard, kernel))
     is_exact = hard < kernel
     np.testing.assert_array_equal(
@@ -159,8 +158,7 @@ def test_threads_do_not_change_a_bit() -> None:
 
 
 def test_normalised_gradients_have_length_one_or_none() -> None:
-    unit = normalise(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]))
-    np.testing.assert_allclose(unit, [[0, 0, 0], [0.6, 0, 0.8]])
+    np.testing.assert_allclose(normalise(np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])), [[0, 0, 0], [0.6, 0, 0.8]])
 
 
 def test_of_equal_distances_the_exact_one_wins() -> None:
@@ -233,9 +231,7 @@ def test_marching_converges_to_the_level_set_before_a_plane() -> None:
     error = [np.abs(field.query(points)[0] - plain).max()]
     for steps in (1, 3, 5, 12):
         error.append(np.abs(march(field, exact, points, steps=steps)[2] - plain).max())
-    assert np.all(np.diff(error) < 0)
-    assert error[0] > 0.02
-    assert error[3] < 0.002
+    assert np.all(np.diff(error) < 0) and error[0] > 0.02 and error[3] < 0.002
     assert error[4] < 3e-4
     hit = march(field, exact, points, steps=12)[0]
     np.testing.assert_allclose(hit[:, 2], planar_zero_level(0.005, LENGTH), atol=5e-4)

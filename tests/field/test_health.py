@@ -41,8 +41,7 @@ FINE = square_lattice(0.01)
 def test_each_ratio_out_of_range_has_its_warning(
     centers: np.ndarray, radii: np.ndarray, length: float, words: tuple[str, ...]
 ) -> None:
-    found = field_health(centers, radii, length, kernels=KERNELS)["warnings"]
-    for warning, part in zip(found, words, strict=True):
+    for warning, part in zip(field_health(centers, radii, length, kernels=KERNELS)["warnings"], words, strict=True):
         assert part in warning
 
 

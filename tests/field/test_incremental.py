@@ -22,8 +22,9 @@ def lattice() -> SplatSet:
     x, y = np.meshgrid(np.arange(-0.3, 0.31, 0.05), np.arange(-0.3, 0.31, 0.05))
     centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     splats = splat_set(centers, np.full(len(centers), 0.01))
-    labels = np.where(np.arange(len(centers)) % 3 == 0, Label.HUMAN, Label.OBJECT).astype(np.uint8)
-    return replace(splats, labels=labels)
+    return replace(
+        splats, labels=np.where(np.arange(len(centers)) % 3 == 0, Label.HUMAN, Label.OBJECT).astype(np.uint8)
+    )
 
 
 def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) -> SplatSet:
@@ -57,8 +58,10 @@ def update_and_compare(
     before: SplatSet, after: SplatSet, config: FieldConfig, channels: Sequence[str], layout: GridLayout = LAYOUT
 ) -> Changes:
     """Update a bake, compare channels and counts with a full bake bit by bit, and return the changes."""
-    of = ((before, 2), (after, 2), (after, 1))
-    old, new, full = (Baker(splats, layout, config, channels=channels, threads=num) for splats, num in of)
+    old, new, full = (
+        Baker(splats, layout, config, channels=channels, threads=num)
+        for splats, num in ((before, 2), (after, 2), (after, 1))
+    )
     num = layout.shape[0]
     arrays, expected = old.allocate(num), full.allocate(num)
     old.bake(0, num, arrays)
@@ -79,8 +82,12 @@ def update_and_compare(
 def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distance: str) -> None:
     before = lattice() if seed % 2 else splat_set(*cloud(400, seed))
     after = edited(before, kind, np.random.default_rng(seed))
-    channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
-    changes = update_and_compare(before, after, replace(CONFIG, distance=distance), channels)
+    changes = update_and_compare(
+        before,
+        after,
+        replace(CONFIG, distance=distance),
+        [name for name in CHANNELS if name != "se" or distance != "hard"],
+    )
     assert changes.num_baked < 0.8 * changes.num_blocks
     if kind != "order" or not seed % 2:
         assert (changes.num_baked > 0) == (kind != "order")

@@ -44,10 +44,10 @@ def test_probability_grows_towards_the_splats_and_never_leaves_its_range() -> No
     radii[:] = 0.01
     for length in (1e-10, 1e-6, 1e-3, 0.02, 1.0, 100.0):
         config = FieldConfig(length_scale=length)
-        points = np.concatenate([centers[:20], queries(100), 40.0 + queries(5)])
-        found = PaperProbability(Spheres.of(centers, radii), config).at(points, np.zeros(0))
-        assert np.isfinite(found).all()
-        assert ((found >= 0) & (found <= 1)).all()
+        found = PaperProbability(Spheres.of(centers, radii), config).at(
+            np.concatenate([centers[:20], queries(100), 40.0 + queries(5)]), np.zeros(0)
+        )
+        assert np.isfinite(found).all() and ((found >= 0) & (found <= 1)).all()
         if length < 0.1:
             assert found[:20].min() > 0.98 * found.max()
             np.testing.assert_allclose(found[-5:], 0.0027, atol=1e-4)

@@ -64,8 +64,7 @@ def smooth_points(margin: float) -> Float64:
     is_single = (each[:, 0] > 0.01) & (each[:, 1] - each[:, 0] > 2 * margin)
     kernel = SeField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, truncation=TRUNCATION))
     has_value = np.isfinite(kernel.query_raw(points)[0])
-    is_apart = np.abs(kernel.query(points)[0] - each[:, 0]) > 2 * margin
-    return points[is_single & has_value & is_apart]
+    return points[is_single & has_value & (np.abs(kernel.query(points)[0] - each[:, 0]) > 2 * margin)]
 
 
 def rotation() -> Float64:

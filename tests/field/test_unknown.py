@@ -32,13 +32,17 @@ def cell_centers(grid: DistanceGrid, chosen: Bool) -> Float64:
 @pytest.fixture(scope="module")
 def grid() -> DistanceGrid:
     """Never seen below z = -0.2 and in a corner; a cell that only the robot was in stands in the corner."""
-    shape = (21, 21, 21)
-    states = np.full(shape, VoxelState.FREE, np.uint8)
+    states = np.full((21, 21, 21), VoxelState.FREE, np.uint8)
     states[:, :, :5] = VoxelState.NEVER_SEEN
     states[15:, 15:, 12:] = VoxelState.NEVER_SEEN
     states[18, 18, 16] = VoxelState.SWEPT_BY_ROBOT
-    occupancy = OccupancyGrid.from_states(BOX.lower, 0.04, states)
-    return bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.04), channels=CHANNELS, occupancy=occupancy)
+    return bake(
+        splat_set(*cloud()),
+        BOX,
+        FieldConfig(voxel=0.04),
+        channels=CHANNELS,
+        occupancy=OccupancyGrid.from_states(BOX.lower, 0.04, states),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +81,7 @@ def test_nan_blanks_never_seen_cells_and_no_other(grid: DistanceGrid, is_unknown
 def test_an_obstacle_distance_is_never_beyond_the_nearest_never_seen_cube(
     grid: DistanceGrid, is_unknown: Bool, solid: DistanceGrid
 ) -> None:
-    cubes = cell_centers(grid, is_unknown)
-    exact = cube_distance(cell_centers(grid, ~is_unknown)[::7], cubes, grid.voxel)
+    exact = cube_distance(cell_centers(grid, ~is_unknown)[::7], cell_centers(grid, is_unknown), grid.voxel)
     sdf = solid.channels["sdf"][~is_unknown][::7]
     before = grid.channels["sdf"][~is_unknown][::7]
     assert (sdf <= np.minimum(before, exact)).all()
@@ -112,8 +115,7 @@ def test_the_bound_certifies_splats_and_never_seen_cells(
     assert (certified <= np.minimum(hard, cubes)).all()
     assert (certified < GridField(grid).certified(points) - 1e-3).any()
     for name in CHANNELS:
-        assert solid.channels[name].dtype == grid.channels[name].dtype
-        assert np.isfinite(solid.channels[name]).all()
+        assert solid.channels[name].dtype == grid.channels[name].dtype and np.isfinite(solid.channels[name]).all()
 
 
 def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: DistanceGrid, is_unknown: Bool) -> None:
@@ -135,8 +137,9 @@ def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
     expect_refusal(
         r"field.unknown: expected free, obstacle or nan, got 'air'", apply_unknown, grid, "air", error=UsageError
     )
-    bare = replace(grid, channels={"sdf": grid.channels["sdf"]})
-    expect_refusal("no channel 'observed'", apply_unknown, bare, "nan")
+    expect_refusal(
+        "no channel 'observed'", apply_unknown, replace(grid, channels={"sdf": grid.channels["sdf"]}), "nan"
+    )
     never = {**grid.channels, "observed": np.zeros_like(grid.channels["observed"])}
     with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw, got none of 9261"):
         apply_unknown(replace(grid, channels=never), "obstacle")

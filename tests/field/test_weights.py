@@ -42,14 +42,14 @@ def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Kernel) -> No
     exact = np.exp(log_row_sums(kernel, Spheres.of(centers, radii)))
     sums = voxel_row_sums(centers, LENGTH, kernel.value)
     error = LENGTH * np.log(sums / exact)  # of the distance, were the splat alone in being near [m]
-    assert np.sqrt(np.mean(error**2)) < 3e-4
-    assert np.abs(error).max() < 2e-3
+    assert np.sqrt(np.mean(error**2)) < 3e-4 and np.abs(error).max() < 2e-3
 
 
 def test_a_lone_splat_has_a_density_of_one_and_a_distant_one_does_not_change_it() -> None:
     assert voxel_row_sums(np.array([[0.3, 0.1, 0.2]]), LENGTH, MATERN.value) == pytest.approx(1.0)
-    several = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.5, 0.5, 0.5], [900.0, 0.0, 0.0]])
-    sums = voxel_row_sums(several, LENGTH, MATERN.value)
+    sums = voxel_row_sums(
+        np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.5, 0.5, 0.5], [900.0, 0.0, 0.0]]), LENGTH, MATERN.value
+    )
     np.testing.assert_allclose(sums[2:], 1.0, atol=1e-12)
     np.testing.assert_allclose(sums[:2], 1 + np.exp(-0.5), rtol=0.1)
 
@@ -67,8 +67,7 @@ def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
     assert residual < 1e-6
     weights = METHODS["cg"](Spheres.of(centers, radii), kernel, NOISE, 1)
     assert weights.num_iterations
-    size = np.exp(weights.log_size + log_values)
-    np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)
+    np.testing.assert_allclose(weights.sign * np.exp(weights.log_size + log_values), dense, atol=3e-3)
 
 
 def test_field_of_the_full_process_is_that_of_the_dense_one() -> None:
@@ -164,8 +163,9 @@ def test_coinciding_splats_share_their_weight() -> None:
     centers, radii = np.zeros((3, 3)), np.full(3, 0.01)
     for weights in ("rowsum", "voxel", "cg"):
         field = GpdfField(Spheres.of(centers, radii), FieldConfig(length_scale=LENGTH, weights=weights, noise=1e-3))
-        distance = field.query(np.array([[0.1, 0.0, 0.0]]))[0][0]
-        assert distance == pytest.approx(0.09, abs=5e-3 if weights == "voxel" else 1e-4), weights
+        assert field.query(np.array([[0.1, 0.0, 0.0]]))[0][0] == pytest.approx(
+            0.09, abs=5e-3 if weights == "voxel" else 1e-4
+        ), weights
 
 
 @pytest.mark.parametrize("kind", [GpdfField, SeField])
@@ -177,12 +177,11 @@ def test_voxel_weights_follow_the_splats_and_their_scale_and_not_their_order(
     points, config = queries(100), FieldConfig(length_scale=LENGTH, noise=1e-2, weights="voxel")
     distance = kind(Spheres.of(centers, radii), config).query(points)[0]
     order = np.random.default_rng(3).permutation(400)
-    shuffled = kind(Spheres.of(centers[order], radii[order]), config)
-    np.testing.assert_allclose(shuffled.query(points)[0], distance, atol=2e-5)
-    large = replace(config, length_scale=8 * LENGTH, truncation=8 * 2e-5)
-    scaled = kind(Spheres.of(8 * centers, 8 * radii), large)
+    np.testing.assert_allclose(
+        kind(Spheres.of(centers[order], radii[order]), config).query(points)[0], distance, atol=2e-5
+    )
+    scaled = kind(Spheres.of(8 * centers, 8 * radii), replace(config, length_scale=8 * LENGTH, truncation=8 * 2e-5))
     np.testing.assert_allclose(scaled.query(8 * points)[0], 8 * distance, atol=4e-5)
     rotation, shift = rotation_from_quat([0.1, -0.5, 0.3, 0.8]), np.array([0.7, -1.1, 0.4])
-    moved = kind(Spheres.of(centers @ rotation.T + shift, radii), config)
-    turned = moved.query(points @ rotation.T + shift)[0]
+    turned = kind(Spheres.of(centers @ rotation.T + shift, radii), config).query(points @ rotation.T + shift)[0]
     np.testing.assert_allclose(turned, distance, atol=1e-3)  # a grid has axes

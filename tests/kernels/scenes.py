@@ -13,8 +13,9 @@ Arrays = tuple[Float32, Float32, Float32, Float32]
 
 def camera(width: int = 45, height: int = 37, motion: Float64 = STILL) -> Float64:
     """Off-centre principal point, sizes that are no multiple of a tile."""
-    T_world_camera = motion @ look_at((0.9, 0.2, 0.6), (0.0, 0.0, 0.05))
-    return pack_camera(50.0, 48.0, 24.3, 16.1, width, height, invert_transform(T_world_camera))
+    return pack_camera(
+        50.0, 48.0, 24.3, 16.1, width, height, invert_transform(motion @ look_at((0.9, 0.2, 0.6), (0.0, 0.0, 0.05)))
+    )
 
 
 def splats(count: int = 60, seed: int = 0) -> Arrays:

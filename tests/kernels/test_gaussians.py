@@ -51,8 +51,7 @@ def test_planes_equal_the_reference(degree: int) -> None:
     planes = rendered(parameters, view, degree)[1]
     expected = reference.render(torch.tensor(view), torch.tensor(parameters.astype(np.float64)), degree).numpy()
     # A pixel whose alpha lies within rounding of 1/255 may fall on either side of the cut.
-    assert np.abs(planes - expected).max() < 1.5 / 255
-    assert np.median(np.abs(planes - expected)) < 1e-6
+    assert np.abs(planes - expected).max() < 1.5 / 255 and np.median(np.abs(planes - expected)) < 1e-6
     assert np.mean(np.abs(planes - expected) > 1e-5) < 2e-3
 
 
@@ -67,8 +66,7 @@ def test_an_isotropic_set_renders_as_the_isotropic_path_does() -> None:
     radii, opacities = np.exp(parameters[:, 3]), 1 / (1 + np.exp(-parameters[:, LOGIT]))
     raster.prepare(camera(), centers, radii, opacities, shades)
     difference = np.abs(rendered(parameters, camera())[1] - raster.forward())
-    assert np.median(difference) < 1e-6
-    assert np.mean(difference > 1e-5) < 1e-3
+    assert np.median(difference) < 1e-6 and np.mean(difference > 1e-5) < 1e-3
 
 
 def test_turning_gaussians_and_camera_together_changes_nothing() -> None:
@@ -81,8 +79,7 @@ def test_turning_gaussians_and_camera_together_changes_nothing() -> None:
     left = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
     moved[:, QUAT] = parameters[:, QUAT] @ left.T
     before = rendered(parameters, camera(), degree=0)[1]
-    after = rendered(moved, camera(motion @ T_WORLD_CAMERA), degree=0)[1]
-    assert np.mean(np.abs(before - after) > 1e-4) < 3e-3
+    assert np.mean(np.abs(before - rendered(moved, camera(motion @ T_WORLD_CAMERA), degree=0)[1]) > 1e-4) < 3e-3
 
 
 def test_the_length_of_a_quaternion_does_not_matter() -> None:

@@ -18,8 +18,7 @@ def images(height: int = 29, width: int = 43, seed: int = 0) -> tuple[Float32, T
     depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
     depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
     counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
-    color = rng.integers(0, 256, (3, height, width), np.uint8)
-    return planes, TargetView(color=color, depth=depth, counted=counted)
+    return planes, TargetView(color=rng.integers(0, 256, (3, height, width), np.uint8), depth=depth, counted=counted)
 
 
 def evaluated(planes: Float32, view: TargetView, weights: LossWeights, threads: int = 1) -> tuple[LossTerms, Float32]:
@@ -60,8 +59,7 @@ def assert_equals_the_reference(planes: Float32, view: TargetView, weights: Loss
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), BACKGROUND])
 @pytest.mark.parametrize("normalised", [False, True])
 def test_value_and_gradient_equal_the_reference(normalised: bool, background: tuple[float, float, float]) -> None:
-    weights = replace(WEIGHTS, normalised=normalised, background=background)
-    assert_equals_the_reference(*images(), weights)
+    assert_equals_the_reference(*images(), replace(WEIGHTS, normalised=normalised, background=background))
 
 
 @pytest.mark.parametrize(("height", "width"), [(3, 70), (60, 8), (61, 7), (97, 21), (121, 33)])
@@ -82,8 +80,7 @@ def test_identical_images_have_no_colour_loss() -> None:
     planes, view = images()
     planes[:3] = view.color / np.float32(255.0)
     terms, gradient = evaluated(planes, view, WEIGHTS)
-    assert (terms.l1, terms.squared) == (0.0, 0.0)
-    assert terms.dssim == pytest.approx(0.0, abs=1e-6)
+    assert (terms.l1, terms.squared, terms.dssim) == (0.0, 0.0, pytest.approx(0.0, abs=1e-6))
     assert np.abs(gradient[:3]).max() < 1e-6
 
 
@@ -92,9 +89,7 @@ def test_pixels_that_do_not_count_change_neither_value_nor_gradient() -> None:
     other = planes.copy()
     other[:3, view.counted == 0] += 0.3
     a, b = evaluated(planes, view, WEIGHTS), evaluated(other, view, WEIGHTS)
-    assert a[0] == b[0]
-    assert np.array_equal(a[1], b[1])
-    assert not a[1][:3, view.counted == 0].any()
+    assert a[0] == b[0] and np.array_equal(a[1], b[1]) and not a[1][:3, view.counted == 0].any()
 
 
 def test_the_background_is_seen_through_what_is_transparent() -> None:
@@ -137,5 +132,4 @@ def test_a_frame_without_depth_has_no_depth_loss() -> None:
 def test_thread_count_does_not_change_a_bit() -> None:
     planes, view = images(120, 161)
     one, two = evaluated(planes, view, WEIGHTS, 1), evaluated(planes, view, WEIGHTS, 2)
-    assert one[0] == two[0]
-    assert one[1].tobytes() == two[1].tobytes()
+    assert (one[0], one[1].tobytes()) == (two[0], two[1].tobytes())

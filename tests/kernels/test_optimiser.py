@@ -78,8 +78,7 @@ def test_three_steps_equal_torch_adam_on_the_reference_renderer() -> None:
         planes.backward(torch.tensor(upstream.astype(np.float64)))
         adam.step()
     want = torch.cat(parts, 1).detach().numpy()
-    assert np.median(np.abs(want - splats()) / RATES) > 1.0
-    assert np.median(np.abs(p - want) / RATES) < 2e-3
+    assert np.median(np.abs(want - splats()) / RATES) > 1.0 and np.median(np.abs(p - want) / RATES) < 2e-3
     assert np.quantile(np.abs(p - want) / RATES, 0.98) < 0.05
 
 
@@ -89,8 +88,7 @@ def test_splats_out_of_view_keep_parameters_and_moments() -> None:
     before, state = p.copy(), moments(len(p))
     stepped(p, state, settings(noise=5e5), np.ones((5, 32, 48), np.float32))
     assert np.array_equal(p[:10], before[:10])
-    assert not state.num_steps[:10].any()
-    assert (state.num_steps[10:] == 1).all()
+    assert not state.num_steps[:10].any() and (state.num_steps[10:] == 1).all()
 
 
 def test_noise_moves_transparent_splats_and_leaves_opaque_ones() -> None:
@@ -100,8 +98,7 @@ def test_noise_moves_transparent_splats_and_leaves_opaque_ones() -> None:
     before = p.copy()
     stepped(p, moments(len(p)), settings(noise=5e5), flat)
     moved = np.linalg.norm(p[:, :3] - before[:, :3], axis=1)
-    assert (moved[:15] > 1e-5).all()
-    assert (moved[:15] <= 0.5 * np.sqrt(3) * np.exp(before[:15, 3]) + 1e-6).all()
+    assert (moved[:15] > 1e-5).all() and (moved[:15] <= 0.5 * np.sqrt(3) * np.exp(before[:15, 3]) + 1e-6).all()
     assert (moved[15:] < 1e-7).all()
 
 
@@ -111,8 +108,7 @@ def test_noise_depends_on_the_seed_alone() -> None:
         results.append(splats())
         results[-1][:, 7] = -2.6
         stepped(results[-1], moments(30), settings(noise=5e5), np.zeros((5, 32, 48), np.float32), seed)
-    assert np.array_equal(results[0], results[1])
-    assert not np.array_equal(results[0], results[2])
+    assert np.array_equal(results[0], results[1]) and not np.array_equal(results[0], results[2])
 
 
 def test_the_regulariser_lowers_opacity() -> None:
@@ -128,5 +124,4 @@ def test_colours_stay_in_their_range() -> None:
         p[:15, 4:7], p[15:, 4:7] = end, 0.5
         for _ in range(3):
             stepped(p, moments(len(p)), settings(), np.full((5, 32, 48), sign, np.float32))
-        assert (p[:15, 4:7] == end).all()
-        assert (sign * (p[15:, 4:7] - 0.5) < 0.0).all()
+        assert (p[:15, 4:7] == end).all() and (sign * (p[15:, 4:7] - 0.5) < 0.0).all()

@@ -41,8 +41,7 @@ def test_pixels_are_back_projected_row_after_row(width: int, height: int) -> Non
     seen, chosen = frame(width, height), RNG.random((height, width)) < 0.3
     wanted, camera = reference.world_points(seen), packed(seen, seen.T_world_camera)
     for threads in THREADS:
-        found = kernels.back_projected(camera, seen.depth, chosen, threads)
-        np.testing.assert_array_equal(found, wanted[chosen])
+        np.testing.assert_array_equal(kernels.back_projected(camera, seen.depth, chosen, threads), wanted[chosen])
     np.testing.assert_array_equal(kernels.back_projected(camera, seen.depth), wanted.reshape(-1, 3))
     assert len(kernels.back_projected(camera, seen.depth, np.zeros_like(chosen))) == 0
 
@@ -57,8 +56,9 @@ def test_pixels_inside_a_box_are_those_whose_points_are(width: int, height: int)
     camera, wanted = packed(seen, seen.T_world_camera), reference.are_inside(seen, box, 1.5)
     assert 0 < np.count_nonzero(wanted) < np.count_nonzero(reference.are_inside(seen, box, 0.0))
     for threads in THREADS:
-        found = kernels.are_inside(camera, seen.depth, box.lower, box.upper, 1.5, threads)
-        np.testing.assert_array_equal(found, wanted)
+        np.testing.assert_array_equal(
+            kernels.are_inside(camera, seen.depth, box.lower, box.upper, 1.5, threads), wanted
+        )
 
 
 @needs_fma
@@ -85,8 +85,9 @@ def test_a_point_is_seen_through_where_any_view_looks_past_it() -> None:
     assert 0 < np.mean(each) < 1
     cameras = [packed(view, invert_transform(view.T_world_camera)) for view in views]
     for threads in THREADS:
-        found = kernels.seen_through(points, cameras, nearest, 0.015, threads)
-        np.testing.assert_array_equal(found, np.any(each, axis=0))
+        np.testing.assert_array_equal(
+            kernels.seen_through(points, cameras, nearest, 0.015, threads), np.any(each, axis=0)
+        )
 
 
 @pytest.mark.parametrize(("count", "edge"), [(1, 0.1), (7, 0.1), (40000, 0.08), (40000, 3.0), (5000, 1e-4)])
@@ -117,8 +118,7 @@ def test_points_are_further_than_the_eight_nearest_balls(count: int, gap: float)
     points = RNG.uniform(-0.2, 1.2, (4000, 3))
     wanted = reference.are_further(centers, radii, points, gap)
     for threads in THREADS:
-        found = kernels.SplatTree(centers, radii, threads).are_further(points, gap)
-        np.testing.assert_array_equal(found, wanted)
+        np.testing.assert_array_equal(kernels.SplatTree(centers, radii, threads).are_further(points, gap), wanted)
     if count == 3000:
         all_balls = (np.linalg.norm(points[:, None] - centers[:1], axis=2) - radii[:1])[:, 0] > gap
         assert (wanted & ~all_balls).any()
@@ -139,7 +139,8 @@ def test_distances_to_solids_are_the_least_of_each() -> None:
         solids.append([kind, *T[:3, :3].ravel(), *T[:3, 3], *size])
         wanted.append(reference.solid_distance(kind, size, transform_points(T, points)))
     for threads in THREADS:
-        found = kernels.solid_distance(points, np.array(solids), threads)
-        np.testing.assert_array_equal(found, np.min(wanted, axis=0))
+        np.testing.assert_array_equal(
+            kernels.solid_distance(points, np.array(solids), threads), np.min(wanted, axis=0)
+        )
     assert (np.min(wanted, axis=0) < 0).any()
     assert np.all(kernels.solid_distance(points, np.zeros((0, 16))) == np.inf)

@@ -25,8 +25,7 @@ def test_planes_equal_the_reference() -> None:
     planes = rendered(arrays, view)[1]
     expected = reference.render(torch.tensor(view), *tensors(arrays)).detach().numpy()
     # A pixel whose alpha lies within rounding of 1/255 may fall on either side of the cut.
-    assert np.abs(planes - expected).max() < 1.2 / 255
-    assert np.median(np.abs(planes - expected)) < 1e-6
+    assert np.abs(planes - expected).max() < 1.2 / 255 and np.median(np.abs(planes - expected)) < 1e-6
     assert np.mean(np.abs(planes - expected) > 1e-5) < 1e-3
 
 
@@ -56,8 +55,7 @@ def test_gradients_equal_autograd_of_the_reference(arrays: Arrays, is_opaque: bo
     expected = reference.render(torch.tensor(camera()), *leaves)
     expected.backward(torch.tensor(upstream.astype(np.float64)))
     difference = np.abs(planes - expected.detach().numpy())
-    assert difference.max() < 1.2 / 255
-    assert np.mean(difference > 1e-5) < 1e-3
+    assert difference.max() < 1.2 / 255 and np.mean(difference > 1e-5) < 1e-3
     for got, leaf in zip([g_centers, g_radii, gradients[:, 6], gradients[:, 7:]], leaves, strict=True):
         want = leaf.grad.numpy()
         assert np.abs(got - want).max() < 2e-3 * np.abs(want).max()
@@ -92,8 +90,9 @@ def test_moving_camera_and_splats_together_changes_nothing() -> None:
 
 def test_a_centred_splat_peaks_at_its_pixel_with_its_opacity() -> None:
     view = pack_camera(100.0, 100.0, 20.0, 15.0, 41, 31, np.eye(4))
-    one = np.float32([[0.0, 0.0, 1.0]]), np.float32([0.02]), np.float32([0.7]), np.float32([[1.0, 0.5, 0.0]])
-    planes = rendered(one, view)[1]
+    planes = rendered(
+        (np.float32([[0.0, 0.0, 1.0]]), np.float32([0.02]), np.float32([0.7]), np.float32([[1.0, 0.5, 0.0]])), view
+    )[1]
     assert np.unravel_index(planes[4].argmax(), planes[4].shape) == (15, 20)
     assert planes[4, 15, 20] == pytest.approx(0.7, abs=1e-6)
     assert planes[:4, 15, 20] == pytest.approx([0.7, 0.35, 0.0, 0.7], abs=1e-6)
@@ -107,8 +106,7 @@ def test_unseeable_splats_are_left_out() -> None:
     view = pack_camera(100.0, 100.0, 20.0, 15.0, 41, 31, np.eye(4))
     raster, planes = rendered((centers, radii, opacities, np.ones((7, 3), np.float32)), view)
     assert not visible(raster).any()
-    assert not planes.any()
-    assert not raster.backward(planes, np.ones_like(planes)).any()
+    assert not planes.any() and not raster.backward(planes, np.ones_like(planes)).any()
     assert not rendered(splats(0), view)[1].any()
 
 

@@ -48,8 +48,9 @@ def scene_of(solids: list[tuple[str, tuple[float, ...], Float64]], triangles: Fl
     rows = []
     for kind, size, T in solids:
         inverse = invert_transform(T)
-        row = [[KINDS[kind]], inverse[:3, :3].ravel(), inverse[:3, 3], size, np.zeros(3 - len(size))]
-        rows.append(np.concatenate(row))
+        rows.append(
+            np.concatenate([[KINDS[kind]], inverse[:3, :3].ravel(), inverse[:3, 3], size, np.zeros(3 - len(size))])
+        )
     return SurfaceScene(
         solids=np.array(rows).reshape(-1, 16),
         solid_links=np.arange(len(solids), dtype=np.int16),
@@ -72,8 +73,7 @@ def ball_faces(center: Float64, radius: float) -> Float64:
 
 
 def rendered(scene: SurfaceScene, measured: np.ndarray | None = None, threads: int = 1) -> SurfaceImage:
-    shape = (int(K[5]), int(K[4]))
-    image = np.zeros(shape, np.float32) if measured is None else measured
+    image = np.zeros((int(K[5]), int(K[4])), np.float32) if measured is None else measured
     return render_surface(scene, K, image, tolerance=TOLERANCE, quadratic=0.0, num_threads=threads)
 
 
@@ -89,9 +89,7 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
         spans = [span(kind, size, inverse[:3, 3], inverse[:3, :3] @ direction) for kind, size, inverse in inverses]
         near, far = np.array(spans).T
         if not np.isfinite(near).any():
-            assert image.depth[v, u] == 0
-            assert image.link[v, u] == -1
-            assert image.inside[v, u] == -1
+            assert (image.depth[v, u], image.link[v, u], image.inside[v, u]) == (0, -1, -1)
             continue
         ends = np.sort(near[np.isfinite(near)])
         if np.min(far[np.isfinite(near)] - near[np.isfinite(near)]) < 0.02 or np.min(np.diff(ends), initial=1) < 1e-4:
@@ -99,8 +97,7 @@ def test_depth_link_and_inside_are_those_of_one_ray_at_a_time(seed: int) -> None
         at = float(measured[v, u])
         gaps = np.abs(np.concatenate([at - TOLERANCE - ends, at + TOLERANCE - far[np.isfinite(near)]]))
         num_seen += 1
-        assert image.depth[v, u] == pytest.approx(near.min(), abs=2e-5)
-        assert image.link[v, u] == np.argmin(near)
+        assert (image.depth[v, u], image.link[v, u]) == (pytest.approx(near.min(), abs=2e-5), np.argmin(near))
         if gaps.min() > 1e-4:
             inside = is_inside_spans(at, TOLERANCE, spans)
             num_inside += inside
@@ -116,8 +113,7 @@ def test_triangles_show_what_their_solid_shows() -> None:
     both = (ball.depth > 0) & (faces.depth > 0)
     assert both.sum() > 200
     assert ((ball.depth > 0) != (faces.depth > 0)).sum() < 20
-    assert np.abs(ball.depth - faces.depth)[both].mean() < 1e-3
-    assert (faces.link[faces.depth > 0] == 7).all()
+    assert np.abs(ball.depth - faces.depth)[both].mean() < 1e-3 and (faces.link[faces.depth > 0] == 7).all()
 
 
 def mesh_scene(triangles: Float64, links: Sequence[int]) -> SurfaceScene:
@@ -134,8 +130,7 @@ def test_the_nearest_triangle_shows_from_whichever_side() -> None:
     for (v, u), direction in zip(np.ndindex(image.depth.shape), rays().reshape(-1, 3), strict=True):
         depths = np.array([triangle_depth(corners, direction) for corners in triangles])
         if not np.isfinite(depths).any():
-            assert image.depth[v, u] == 0
-            assert image.link[v, u] == -1
+            assert (image.depth[v, u], image.link[v, u]) == (0, -1)
             continue
         num_shown += 1
         assert image.depth[v, u] == pytest.approx(depths.min(), rel=1e-6)
@@ -149,8 +144,7 @@ def test_of_two_triangles_in_one_place_the_first_shows(is_first_from_inside: boo
     corners = np.array([[-0.2, -0.2, 1.0], [0.2, -0.2, 1.0], [0.0, 0.3, 1.0]])
     both = np.array([corners, corners[::-1]])
     image = rendered(mesh_scene(both[::-1] if is_first_from_inside else both, [3, 5]))
-    assert (image.link[image.depth > 0] == 3).all()
-    assert (image.depth > 0).sum() > 100
+    assert (image.link[image.depth > 0] == 3).all() and (image.depth > 0).sum() > 100
 
 
 def test_a_triangle_that_reaches_behind_the_camera_hides_none() -> None:

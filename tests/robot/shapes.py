@@ -168,5 +168,10 @@ source="#p"/></vertices><triangles count="{faces}"><input semantic="VERTEX" sour
 def collada(mesh: trimesh.Trimesh) -> str:
     """The mesh as COLLADA text, in metres."""
     numbers, indices = (" ".join(map(str, values.ravel().tolist())) for values in (mesh.vertices, mesh.faces))
-    sizes = {"count": mesh.vertices.size, "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    return COLLADA.format(numbers=numbers, indices=indices, **sizes)
+    return COLLADA.format(
+        numbers=numbers,
+        indices=indices,
+        count=mesh.vertices.size,
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+    )

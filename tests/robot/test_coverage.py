@@ -32,13 +32,11 @@ def samples(triangles: np.ndarray, count: int, seed: int) -> np.ndarray:
 def test_one_ball_in_a_cube_leaves_corners_by_a_known_distance_and_six_squares_less_discs() -> None:
     found = largest_deficit(CUBE, np.zeros((1, 3)), np.array([0.12]))
     expected = np.sqrt(3) * 0.1 - 0.12
-    assert found.lower == pytest.approx(expected, abs=1e-12)
-    assert expected <= found.proven <= expected + 1e-5
+    assert found.lower == pytest.approx(expected, abs=1e-12) and expected <= found.proven <= expected + 1e-5
     np.testing.assert_allclose(np.abs(found.place), 0.1)
     area = 6 * (0.04 - np.pi * (0.12**2 - 0.1**2))
     best, lower, upper = uncovered_area(CUBE, np.zeros((1, 3)), np.array([0.12]))
-    assert lower <= area <= upper < lower + 0.03 * 0.24
-    assert best == pytest.approx(area, rel=2e-3)
+    assert lower <= area <= upper < lower + 0.03 * 0.24 and best == pytest.approx(area, rel=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -48,8 +46,7 @@ def test_no_dense_sample_and_no_climb_from_it_beats_the_proven_deficit(seed: int
     found = largest_deficit(CUBE, centers, radii)
     points = samples(CUBE, 3000, seed)
     value = phi(points, centers, radii)
-    assert value.max() <= found.proven
-    assert found.proven - found.lower <= 1e-5 + 1e-12
+    assert value.max() <= found.proven and found.proven - found.lower <= 1e-5 + 1e-12
     assert phi(found.place[None], centers, radii)[0] == pytest.approx(found.lower, abs=1e-12)
     best = points[np.argsort(value)[-5:]]  # adversary: walk on the cube's faces from the best samples
     for step in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
@@ -72,8 +69,7 @@ def test_bounds_on_the_uncovered_area_hold_a_dense_sample(seed: int) -> None:
     centers, radii = rng.uniform(-0.1, 0.1, (5, 3)), rng.uniform(0.05, 0.12, 5)
     best, lower, upper = uncovered_area(CUBE, centers, radii)
     share = np.mean(phi(samples(CUBE, 8000, seed), centers, radii) > 0)
-    assert lower - 0.006 <= share * 0.24 <= upper + 0.006
-    assert best == pytest.approx(share * 0.24, abs=0.006)
+    assert lower - 0.006 <= share * 0.24 <= upper + 0.006 and best == pytest.approx(share * 0.24, abs=0.006)
 
 
 def test_a_hole_between_two_spheres_that_no_corner_sees_is_found() -> None:
@@ -88,12 +84,14 @@ def test_coverage_moves_rigidly_and_scales() -> None:
     centers, radii = rng.uniform(-0.1, 0.1, (6, 3)), rng.uniform(0.03, 0.09, 6)
     T = look_at([0.3, 1.0, -2.0], [0, 0, 0.5])
     here = largest_deficit(CUBE, centers, radii)
-    there = largest_deficit(transform_points(T, CUBE), transform_points(T, centers), radii)
-    assert there.proven == pytest.approx(here.proven, abs=2e-4)
+    assert largest_deficit(transform_points(T, CUBE), transform_points(T, centers), radii).proven == pytest.approx(
+        here.proven, abs=2e-4
+    )
     order = rng.permutation(6)
     assert largest_deficit(CUBE, centers[order], radii[order]).proven == here.proven
-    double = largest_deficit(2 * CUBE, 2 * centers, 2 * radii, tolerance=2 * DEFICIT_GAP)
-    assert double.proven == pytest.approx(2 * here.proven, rel=1e-12)
+    assert largest_deficit(2 * CUBE, 2 * centers, 2 * radii, tolerance=2 * DEFICIT_GAP).proven == pytest.approx(
+        2 * here.proven, rel=1e-12
+    )
 
 
 def spheres(*rows: tuple[str, list[float], float]) -> SphereSet:
@@ -110,10 +108,8 @@ def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path)
     report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.15), ("tip", [0.01, 0, 0], 0.1)))
     base, tip = report.links
     assert base.deficit.proven == pytest.approx(np.linalg.norm(half) - 0.15, abs=1e-4)
-    assert base.protrusion == pytest.approx(0.1)
-    assert 0 < base.uncovered_share < 1
-    assert (tip.is_covered, tip.uncovered_share) == (True, 0.0)
-    assert tip.protrusion == pytest.approx(0.1 + 0.01 - 0.08)
+    assert base.protrusion == pytest.approx(0.1) and 0 < base.uncovered_share < 1
+    assert (tip.is_covered, tip.uncovered_share, tip.protrusion) == (True, 0.0, pytest.approx(0.1 + 0.01 - 0.08))
     assert report.worst is base
     assert (report.max_protrusion, report.num_spheres, report.stray_spheres) == (base.protrusion, 2, 0)
 
@@ -121,11 +117,9 @@ def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path)
 def test_a_ball_in_its_own_sphere_is_covered_exactly_and_a_link_without_one_has_no_bound(tmp_path: Path) -> None:
     urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
     exact = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.08 - 1e-6)))
-    assert [link.is_covered for link in exact.links] == [True, False]
-    assert exact.max_deficit == pytest.approx(1e-6)
+    assert ([link.is_covered for link in exact.links], exact.max_deficit) == ([True, False], pytest.approx(1e-6))
     report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08)))
-    assert report.bare_links == ("tip",)
-    assert (report.worst, report.max_deficit) == (None, None)
+    assert report.bare_links == ("tip",) and (report.worst, report.max_deficit) == (None, None)
     assert report.uncovered_share == pytest.approx(0.5)
 
 
@@ -140,11 +134,13 @@ def test_a_ball_in_its_own_sphere_is_covered_exactly_and_a_link_without_one_has_
 def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
     real_data: Path, name: str, share: float, deficit: float
 ) -> None:
-    urdf = read_urdf(real_data / "vamp_panda/resources/panda/panda.urdf")
-    report = coverage_deficit(urdf, read_spheres(real_data / name), resolution=5e-3)
+    report = coverage_deficit(
+        read_urdf(real_data / "vamp_panda/resources/panda/panda.urdf"),
+        read_spheres(real_data / name),
+        resolution=5e-3,
+    )
     assert report.uncovered_share == pytest.approx(share, abs=0.005)
-    assert report.max_deficit == pytest.approx(deficit, abs=2e-4)
-    assert report.open_links == ("panda_link6",)
+    assert report.max_deficit == pytest.approx(deficit, abs=2e-4) and report.open_links == ("panda_link6",)
 
 
 def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_them_all(tmp_path: Path) -> None:
@@ -157,8 +153,9 @@ def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_t
     three = spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.07), ("pad", [0, 0, 0], 0.05))
     model = RobotModel.from_urdf(path, three)
     assert np.isnan(model.sphere_deficit).all() and "not read" in model.coverage_unknown
-    measured = model.replace_coverage(coverage_deficit(model.urdf, three))
-    np.testing.assert_allclose(measured.sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9)
+    np.testing.assert_allclose(
+        model.replace_coverage(coverage_deficit(model.urdf, three)).sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9
+    )
     assert np.isnan(model.sphere_deficit).all()
     with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
         coverage_deficit(model.urdf, spheres(("wing", [0, 0, 0], 0.1)))

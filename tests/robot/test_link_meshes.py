@@ -30,8 +30,7 @@ def rod_distance(p: np.ndarray) -> np.ndarray:
 def test_signed_distance_to_a_primitive_is_that_of_its_formula(tmp_path: Path, shape: str, truth) -> None:  # type: ignore[no-untyped-def]
     (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(shape, BALL))))["base"]
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3))
-    assert solid.surface.is_closed
-    assert solid.slack <= 4e-4
+    assert solid.surface.is_closed and solid.slack <= 4e-4
     np.testing.assert_allclose(SolidDistance([solid])(points), truth(points), atol=solid.slack + 1e-12)
 
 
@@ -47,16 +46,16 @@ def test_the_true_surface_is_within_the_slack_of_the_triangles(tmp_path: Path, s
         surface = np.column_stack([round_, rng.uniform(-0.2, 0.2, 4000)])
     mesh = trimesh.Trimesh(solid.surface.vertices, solid.surface.faces, process=False)
     corners = solid.surface.corners
-    normals = mesh.face_normals
-    height = np.einsum("fa,qfa->qf", normals, surface[:, None] - corners[None, :, 0]).max(axis=1)
+    height = np.einsum("fa,qfa->qf", mesh.face_normals, surface[:, None] - corners[None, :, 0]).max(axis=1)
     assert 0.5 * solid.slack < height.max() <= solid.slack  # convex: the distance is at least the highest plane
 
 
 def test_meshes_take_scale_and_origin_of_the_urdf(tmp_path: Path) -> None:
     l_shape().export(tmp_path / "ell.stl")
     origin = '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
-    mesh = '<mesh filename="ell.stl" scale="2 -1 1"/>'
-    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(mesh, BALL, origin=origin))))["base"]
+    (solid,) = read_solids(
+        read_urdf(written(tmp_path, arm_of('<mesh filename="ell.stl" scale="2 -1 1"/>', BALL, origin=origin)))
+    )["base"]
     assert solid.surface.is_closed
     vertices = solid.surface.vertices
     np.testing.assert_allclose(vertices.min(axis=0), [1, 2, 3], atol=1e-6)  # (x, -y) turned by a quarter: (y, x)
@@ -87,8 +86,7 @@ def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder:
     )
     if folder is not None:
         expect_refusal(r"link 'base': mesh package://far/ell.stl was not found; give the folder", read_solids, urdf)
-    folders = [] if folder is None else [tmp_path / folder]
-    assert len(read_solids(urdf, folders)["base"][0].surface.faces) == 20
+    assert len(read_solids(urdf, [] if folder is None else [tmp_path / folder])["base"][0].surface.faces) == 20
 
 
 @pytest.mark.parametrize(
@@ -116,11 +114,15 @@ def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull_wher
     opened = trimesh.Trimesh(opened.vertices + np.array([1, 0, 0]), opened.faces[1:], process=False)
     trimesh.util.concatenate([closed, opened]).export(tmp_path / "two.stl")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False).export(tmp_path / "sheet.stl")
-    text = arm_of('<mesh filename="two.stl"/>', '<mesh filename="sheet.stl"/>')
-    solids = read_solids(read_urdf(written(tmp_path, text)))
+    solids = read_solids(
+        read_urdf(written(tmp_path, arm_of('<mesh filename="two.stl"/>', '<mesh filename="sheet.stl"/>')))
+    )
     assert [solid.surface.is_closed for solid in solids["base"]] == [True, False]
-    distance = SolidDistance(solids["base"])(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]]))
-    np.testing.assert_allclose(distance, [-0.05, -0.1, 0.4], atol=1e-6)
+    np.testing.assert_allclose(
+        SolidDistance(solids["base"])(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]])),
+        [-0.05, -0.1, 0.4],
+        atol=1e-6,
+    )
     assert solids["tip"][0].body is None
     np.testing.assert_allclose(SolidDistance(solids["tip"])(np.array([[0.2, 0.2, 0.3]])), [0.3])
 

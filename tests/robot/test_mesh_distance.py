@@ -73,8 +73,9 @@ def test_triangles_of_very_different_sizes_are_all_tried() -> None:
     distance, _, is_inside = MeshDistance(mesh).closest(points)
     np.testing.assert_allclose(distance, distance_to_triangles(points, mesh.corners), atol=1e-12)
     assert not is_inside.any()
-    near = MeshDistance(mesh).distance(points, 0.1)
-    np.testing.assert_array_equal(near, np.where(distance <= 0.1, distance, np.inf))
+    np.testing.assert_array_equal(
+        MeshDistance(mesh).distance(points, 0.1), np.where(distance <= 0.1, distance, np.inf)
+    )
 
 
 def test_distance_turns_with_the_mesh_and_scales_with_it() -> None:
@@ -98,5 +99,4 @@ def test_an_open_mesh_has_no_inside_and_a_seam_does_not_open_one(tmp_path: Path)
     assert load_mesh(tmp_path / "seams.stl").is_closed
     trimesh.Trimesh(box.vertices, box.faces[:-1], process=False).export(tmp_path / "open.stl")
     mesh = load_mesh(tmp_path / "open.stl")
-    assert not mesh.is_closed
-    assert MeshDistance(mesh).signed(np.zeros((1, 3)))[0] == pytest.approx(0.1)
+    assert not mesh.is_closed and MeshDistance(mesh).signed(np.zeros((1, 3)))[0] == pytest.approx(0.1)

@@ -107,8 +107,9 @@ def test_continuous_and_prismatic_joints_take_one_number_each_and_a_locked_one_n
 )
 def test_unusable_urdfs_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
     written(tmp_path, text)
-    path = tmp_path / ("robot.urdf" if text else "none.urdf")
-    assert ".urdf" in expect_refusal(message, RobotModel.from_urdf, path)
+    assert ".urdf" in expect_refusal(
+        message, RobotModel.from_urdf, tmp_path / ("robot.urdf" if text else "none.urdf")
+    )
 
 
 @pytest.mark.parametrize(
@@ -153,10 +154,8 @@ def test_links_without_a_sphere_are_said(plain_arm: Path, real_data: Path, tmp_p
         "collision_spheres: {link3: [{center: [0, 0, 0], radius: 0.05}], gripper: [{center: [0, 0, 0], radius: 0.1}]}"
     )
     model = RobotModel.from_urdf(urdf, few)
-    assert "link3" not in model.bare_links
-    assert {"link0", "link7", "hand"} <= set(model.bare_links)
-    assert "no sphere covers link0" in model.doubts[0]
-    assert "gripper" in model.doubts[1]
+    assert "link3" not in model.bare_links and {"link0", "link7", "hand"} <= set(model.bare_links)
+    assert "no sphere covers link0" in model.doubts[0] and "gripper" in model.doubts[1]
     foreign = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
     assert any("same robot" in doubt for doubt in RobotModel.from_urdf(urdf, foreign).doubts)
 
@@ -172,8 +171,9 @@ def test_frames_and_spheres_stand_and_move_as_pinocchio_says(arm: RobotModel, ar
             index = model.getFrameId(link, pinocchio.FrameType.BODY)
             poses[link] = T_WORLD_BASE @ data.oMf[index].homogeneous
             np.testing.assert_allclose(arm.frame_pose(q, link), poses[link], atol=1e-12)
-            aligned = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            jacobian = np.asarray(pinocchio.computeFrameJacobian(model, data, q, index, aligned))
+            jacobian = np.asarray(
+                pinocchio.computeFrameJacobian(model, data, q, index, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            )
             expected = np.vstack([base @ jacobian[:3], base @ jacobian[3:]])
             np.testing.assert_allclose(arm.frame_jacobian(q, link), expected, atol=1e-12)
         spheres = zip(arm.sphere_set.links, arm.sphere_set.centers, strict=True)
@@ -208,5 +208,4 @@ def test_what_a_robot_carries_is_part_of_it_and_moves_with_its_link(arm: RobotMo
         assert surface.distance(poses, bottom[None])[0] == pytest.approx(0.0, abs=1e-9)
     own = carrying.self_pairs()
     links = np.array(carrying.sphere_set.links)
-    assert not np.any((own >= num) & np.isin(links[own[:, ::-1]], ["hand", "link7"]))
-    assert np.any(own >= num)
+    assert not np.any((own >= num) & np.isin(links[own[:, ::-1]], ["hand", "link7"])) and np.any(own >= num)

@@ -34,8 +34,7 @@ def seen(
     for number, move in enumerate(moves):
         still = poses(*moves[min(max(number, held.start), held.stop - 1)])["arm"] @ IN_ARM
         its = box("arm", IN_ARM) if number in held else box("world", still)
-        truth = RobotSurface.from_parts([*shapes(has_bracket=has_bracket), its])
-        new, poses_of = recorded([move], truth, noise)
+        new, poses_of = recorded([move], RobotSurface.from_parts([*shapes(has_bracket=has_bracket), its]), noise)
         frames += [replace(frame, stamp_ns=number * PERIOD) for frame in new]
         at.append(poses_of)
     return frames, np.concatenate(at)
@@ -48,8 +47,7 @@ def learned(start: int, stop: int, noise: float = 0.0, *, has_bracket: bool = Fa
 
 def off_box(triangles: Float64) -> float:
     """How far [m] a surface is outside the box, and the box's free sides from the surface, at most."""
-    alone = RobotSurface.from_parts([box("arm", IN_ARM)])
-    outside = alone.distance(np.eye(4)[None], triangles.reshape(-1, 3)).max()
+    outside = RobotSurface.from_parts([box("arm", IN_ARM)]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max()
     ticks = (-0.02, 0.0, 0.02)
     shown = [(EDGE / 2, a, b) for a in ticks for b in ticks]  # its lower side is not
     shown += [(x, y, EDGE / 2) for x in (0.0, 0.02) for y in ticks]

@@ -156,8 +156,7 @@ def test_spheres_that_stick_out_or_leave_much_or_all_uncovered_fool_nobody(
     model, surfaces = folding_arm(tmp_path, spheres)
     assert surfaces.pairs == (("block", "drum"),)
     found = nearest(model, surfaces, OPEN, FOLDED, CROSSED)
-    assert found[0] == pytest.approx(GAP, abs=1e-4)
-    assert found[1] < -0.004 and found[2] < 0
+    assert found[0] == pytest.approx(GAP, abs=1e-4) and found[1] < -0.004 and found[2] < 0
 
 
 def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> None:
@@ -169,12 +168,9 @@ def test_a_body_without_geometry_is_judged_by_its_spheres(tmp_path: Path) -> Non
 
 def test_pairs_of_an_srdf_or_that_no_posture_parts_are_not_judged(tmp_path: Path) -> None:
     model, _ = folding_arm(tmp_path, covering_spheres())
-    solids = read_solids(model.urdf)
-    silent = SelfSurfaces(model, solids, {frozenset(("drum", "block"))})
-    assert silent.pairs == silent.names == ()
-    assert nearest(model, silent, FOLDED)[0] == np.inf
-    low = URDF.replace('xyz="0 0 0.052"', 'xyz="0 0 0.02"')
-    assert folding_arm(tmp_path, covering_spheres(), low)[1].pairs == ()
+    silent = SelfSurfaces(model, read_solids(model.urdf), {frozenset(("drum", "block"))})
+    assert silent.pairs == silent.names == () and nearest(model, silent, FOLDED)[0] == np.inf
+    assert folding_arm(tmp_path, covering_spheres(), URDF.replace('xyz="0 0 0.052"', 'xyz="0 0 0.02"'))[1].pairs == ()
 
 
 MARGIN = 0.02
@@ -255,8 +251,7 @@ def test_rows_and_planner_keep_the_margin_of_their_pair(
 
 def moved(arm: RobotModel, start: ArrayLike, goal: ArrayLike) -> ReplayTrace:
     """The closed loop from one posture towards where the drum is in another."""
-    goal_pose = arm.frame_pose(np.array(goal), "drum")
-    task = ReplayTask(start=np.array(start), T_world_goal=goal_pose, frame="drum")
+    task = ReplayTask(start=np.array(start), T_world_goal=arm.frame_pose(np.array(goal), "drum"), frame="drum")
     return closed_loop(arm, ControlConfig(solver="daqp", max_time=6.0), task, lambda _: FAR)
 
 

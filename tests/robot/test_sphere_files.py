@@ -128,26 +128,26 @@ def test_no_centre_moves_more_per_radian_than_its_lever_arm(seed: int) -> None:
     levers = lever_arms(chain, lower, upper)
     q = np.random.default_rng(seed + 10).uniform(lower, upper, (400, len(lower)))
     travel = np.max([np.linalg.norm(chain.jacobians(row)[1], axis=1) for row in q], axis=0)
-    assert np.all(travel <= levers + 1e-12)
-    assert np.all((travel > 0) == (levers > 0))
+    assert np.all(travel <= levers + 1e-12) and np.all((travel > 0) == (levers > 0))
     assert np.min(travel[levers > 0] / levers[levers > 0]) > 0.4  # bounds, but not idle ones
     for s, body in enumerate(chain.sphere_body):
         if body > 0 and chain.kind[body] == REVOLUTE:  # by its own joint, it is its distance to the axis
-            across = np.linalg.norm(np.cross(chain.axis[body], chain.offset[s]))
-            assert levers[s, body - 1] == pytest.approx(across, abs=1e-12)
+            assert levers[s, body - 1] == pytest.approx(
+                np.linalg.norm(np.cross(chain.axis[body], chain.offset[s])), abs=1e-12
+            )
 
 
 def test_the_robot_knows_its_lever_arms(plain_arm: Path) -> None:
     arm = RobotModel.from_urdf(plain_arm / "tabletop/robot.urdf", plain_arm / "tabletop/robot_spheres.yaml")
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (100, arm.num_joints))
-    travel = np.max([np.linalg.norm(arm.spheres_at(row)[1], axis=1) for row in q], axis=0)
-    assert np.all(travel <= arm.lever_arms() + 1e-12)
+    assert np.all(
+        np.max([np.linalg.norm(arm.spheres_at(row)[1], axis=1) for row in q], axis=0) <= arm.lever_arms() + 1e-12
+    )
 
 
 def test_spheres_of_a_carried_box_cover_it_and_stick_out_by_millimetres() -> None:
     box = Box(lower=np.array([-0.025, -0.03, 0.07]), upper=np.array([0.025, 0.05, 0.12]))
-    alone = SphereSet(links=("arm",), centers=np.zeros((1, 3)), radii=np.array([0.1]))
-    spheres = add_boxes(alone, [("hand", box)])
+    spheres = add_boxes(SphereSet(links=("arm",), centers=np.zeros((1, 3)), radii=np.array([0.1])), [("hand", box)])
     assert (spheres.links[0], set(spheres.links[1:])) == ("arm", {"hand"})
     centers, radii = spheres.centers[1:], spheres.radii[1:]
     corners = np.array(list(product(*zip(box.lower, box.upper, strict=True))))

@@ -75,15 +75,13 @@ def test_more_spheres_stick_out_less_and_one_each_is_the_least(
     two, sixteen = (fit_spheres(solids, rough(max_spheres=count)) for count in (2, 16))
     protrusions = []
     for count, spheres in ((2, two), (6, six), (16, sixteen)):
-        assert len(spheres.radii) <= count
-        assert set(spheres.links) == {"base", "tip"}
+        assert len(spheres.radii) <= count and set(spheres.links) == {"base", "tip"}
         protrusions.append(coverage_of_solids(urdf, solids, spheres).max_protrusion)
     assert protrusions[0] > 1.5 * protrusions[1] > 2 * protrusions[2]
 
 
 def test_one_ball_around_a_box_is_the_smallest_there_is(tmp_path: Path) -> None:
-    solids = read_solids(read_urdf(written(tmp_path, arm_of(BOX, BOX))))
-    spheres = fit_spheres(solids, rough(max_spheres=2))
+    spheres = fit_spheres(read_solids(read_urdf(written(tmp_path, arm_of(BOX, BOX)))), rough(max_spheres=2))
     smallest = np.linalg.norm([0.15, 0.1, 0.05])
     assert np.all(spheres.radii >= smallest)
     np.testing.assert_allclose(spheres.radii, smallest, atol=5e-3)
@@ -92,8 +90,7 @@ def test_one_ball_around_a_box_is_the_smallest_there_is(tmp_path: Path) -> None:
 def test_a_protrusion_is_kept_by_few_spheres(urdf: UrdfFile, solids: Solids) -> None:
     spheres = fit_spheres(solids, rough(max_protrusion=0.04))
     report = coverage_of_solids(urdf, solids, spheres)
-    assert report.max_protrusion <= 0.04
-    assert report.max_deficit == 0
+    assert report.max_protrusion <= 0.04 and report.max_deficit == 0
     assert 3 <= len(spheres.radii) <= 30
 
 
@@ -112,13 +109,11 @@ def test_the_same_seed_gives_the_same_spheres(solids: Solids, six: SphereSet) ->
 def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
     sheet = trimesh.creation.box(extents=(0.2, 0.1, 0.001))
     trimesh.Trimesh(sheet.vertices, sheet.faces[1:], process=False).export(tmp_path / "open.stl")
-    flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]], process=False)
-    flat.export(tmp_path / "flat.stl")
+    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]], process=False).export(tmp_path / "flat.stl")
     urdf = read_urdf(written(tmp_path, arm_of('<mesh filename="open.stl"/>', '<mesh filename="flat.stl"/>')))
     solids = read_solids(urdf)
     report = coverage_of_solids(urdf, solids, fit_spheres(solids, rough(max_spheres=8)))
-    assert report.max_deficit == 0
-    assert report.open_links == ("base", "tip")
+    assert report.max_deficit == 0 and report.open_links == ("base", "tip")
 
 
 @pytest.mark.parametrize(

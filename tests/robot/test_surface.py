@@ -26,8 +26,9 @@ SPHERES = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.fu
 
 def distance(model: RobotModel, points: Float64, **only: Any) -> Float64:
     surface, q = model.surface, np.zeros(1)
-    poses = surface.poses({link: model.frame_pose(q, link) for link in surface.links})
-    return surface.distance(poses, points, **only)
+    return surface.distance(
+        surface.poses({link: model.frame_pose(q, link) for link in surface.links}), points, **only
+    )
 
 
 def test_a_capsule_is_a_cylinder_with_round_ends(tmp_path: Path) -> None:
@@ -93,8 +94,9 @@ def test_a_mesh_in_another_unit_is_refused_with_the_unit_that_it_looks_like(
 ) -> None:
     l_shape().apply_scale(factor).export(tmp_path / "ell.obj", digits=12)
     mesh = f'<mesh filename="ell.obj" scale="{scale}"/>'
-    text = seen_as(arm_of(BALL, BALL), mesh) if is_visual else arm_of(mesh, BALL)
-    model = RobotModel.from_urdf(written(tmp_path, text), SPHERES)
+    model = RobotModel.from_urdf(
+        written(tmp_path, seen_as(arm_of(BALL, BALL), mesh) if is_visual else arm_of(mesh, BALL)), SPHERES
+    )
     with pytest.raises(InputError) as refused:
         assert model.surface
     assert str(refused.value) == f"link 'base': mesh ell.obj: expected a length of 1 mm to 10 m, {line}"
@@ -133,8 +135,7 @@ def test_the_distance_to_a_mesh_is_exact_and_negative_inside(tmp_path: Path) -> 
     l_shape().export(tmp_path / "ell.stl")
     model, gone = with_visual(tmp_path, "ell.stl"), with_visual(tmp_path, "gone.stl").surface
     assert len(model.surface.triangles) == len(l_shape().faces) and len(model.surface.kinds) == 1
-    assert not len(gone.triangles) and len(gone.kinds) == 2
-    assert model.surface.by_spheres == gone.by_spheres == ()
+    assert not len(gone.triangles) and len(gone.kinds) == 2 and model.surface.by_spheres == gone.by_spheres == ()
     points = np.random.default_rng(3).uniform(-0.1, 0.4, (400, 3)) + np.array([0, 0, 0.3])
     arms = [trimesh.creation.box(bounds=b) for b in ([[0, 0, 0], [0.3, 0.1, 0.1]], [[0, 0, 0], [0.1, 0.3, 0.1]])]
     gaps = []

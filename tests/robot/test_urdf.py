@@ -30,8 +30,11 @@ NO_SPHERES = SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
     ],
 )
 def test_joints_without_proper_limits_are_refused(tmp_path: Path, limit: str, message: str) -> None:
-    path = written(tmp_path, arm_of(BALL, BALL).replace(LIMIT, limit))
-    expect_refusal(f"robot.urdf: joint 'hinge': {message}", read_urdf, path)
+    expect_refusal(
+        f"robot.urdf: joint 'hinge': {message}",
+        read_urdf,
+        written(tmp_path, arm_of(BALL, BALL).replace(LIMIT, limit)),
+    )
 
 
 def test_a_joint_that_mimics_is_locked_with_its_leader(tmp_path: Path) -> None:
@@ -47,16 +50,16 @@ def test_a_joint_that_mimics_is_locked_with_its_leader(tmp_path: Path) -> None:
     assert read_urdf(path).add_followers({"slide": 0.1}) == {"follower": pytest.approx(0.3), "slide": 0.1}
     assert read_urdf(path).add_followers({"slide": 0.1, "follower": 0.0})["follower"] == 0.0
     model = RobotModel.from_urdf(path, locked={"slide": 0.1})
-    assert model.joint_names == ("hinge",)
-    assert model.frame_pose(np.zeros(1), "finger")[0, 3] == pytest.approx(0.3)
+    assert model.joint_names == ("hinge",) and model.frame_pose(np.zeros(1), "finger")[0, 3] == pytest.approx(0.3)
     assert model.frame_pose(np.zeros(1), "thumb")[0, 3] == pytest.approx(0.1)
 
 
 def test_a_robot_loads_with_a_set_of_spheres_or_none_at_all(tmp_path: Path) -> None:
     path = written(tmp_path, arm_of(BOX, BALL))
     assert RobotModel.from_urdf(path, NO_SPHERES).bare_links == ("base", "tip")
-    one = SphereSet(links=("tip",), centers=np.array([[0, 0, 0.1]]), radii=np.array([0.1]))
-    model = RobotModel.from_urdf(path, one)
+    model = RobotModel.from_urdf(
+        path, SphereSet(links=("tip",), centers=np.array([[0, 0, 0.1]]), radii=np.array([0.1]))
+    )
     np.testing.assert_allclose(model.sphere_centers(np.array([np.pi / 2])), [[0.1, 0, 0.3]], atol=1e-12)
     with pytest.raises(InputError, match="sphere set: none of its links is in"):
         RobotModel.from_urdf(path, SphereSet(links=("wing",), centers=np.zeros((1, 3)), radii=np.ones(1)))
@@ -74,9 +77,7 @@ def test_real_arms_load_with_seven_joints(
     real_data: Path, name: str, locked: dict[str, float], num_meshes: int
 ) -> None:
     model = RobotModel.from_urdf(real_data / name, NO_SPHERES, locked=locked)
-    assert model.num_joints == 7
-    assert len(model.urdf.meshes) == num_meshes
-    assert np.all(model.lower < model.upper)
+    assert model.num_joints == 7 and len(model.urdf.meshes) == num_meshes and np.all(model.lower < model.upper)
 
 
 def test_the_hand_of_a_real_arm_moves_with_its_last_link(real_data: Path) -> None:

@@ -53,8 +53,7 @@ def test_seeds_lie_where_the_views_agree() -> None:
     """They are at most one step of depth off. Black tiles get none, as the background is black."""
     seeds = seeds_of(views(), 3000)
     z = seeds.centers[np.abs(seeds.centers[:, 0]) < 0.5, 2]  # in all views
-    assert len(z) > 100
-    assert np.median(np.abs(z - WALL)) < 0.2
+    assert len(z) > 100 and np.median(np.abs(z - WALL)) < 0.2
     assert seeds.colors.mean(axis=1).min() > 0.03
 
 
@@ -76,8 +75,7 @@ def glare() -> list[RgbdFrame]:
 def test_no_seed_lies_before_measured_depth() -> None:
     """Though the white of the plane agrees with the glare in front of it."""
     seeds = seeds_of(glare())
-    assert len(seeds) > 0
-    assert seeds.centers[:, 2].min() > 0.95 * BLOCK
+    assert len(seeds) > 0 and seeds.centers[:, 2].min() > 0.95 * BLOCK
 
 
 @pytest.mark.parametrize("most", [0, 5, 40])

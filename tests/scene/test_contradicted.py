@@ -63,8 +63,7 @@ def test_a_ray_proves_nothing_free_where_another_camera_sees_through_what_it_mea
     is_unproven = (found.unproven(shiny).depth == 0) & (shiny.depth > 0)
     assert is_unproven.sum() > 0.5 * (shiny.depth < HEIGHT).sum() and not found.until.any()
     assert not found.pixels(shiny.depth.shape).any()  # what it measures stays a surface of the map
-    points = points_of(found, shiny, is_blank=False)
-    assert HEIGHT - 0.6 - 1e-6 <= points[:, 2].min() < HEIGHT - 0.6 + CONFIG.voxel
+    assert HEIGHT - 0.6 - 1e-6 <= points_of(found, shiny, is_blank=False)[:, 2].min() < HEIGHT - 0.6 + CONFIG.voxel
     assert beside.until.any() and beside.unproven(OTHER) is OTHER
 
 
@@ -109,8 +108,7 @@ def grazing(angle: float, away: float) -> RgbdFrame:
 def test_a_floor_seen_at_any_angle_says_where_a_dark_block_returns_no_depth(angle: float) -> None:
     """The steepest step between two pixels of the floor is 4 cm at 0.4 rad."""
     found, _ = contradict_all(block_measured_at(0.0), grazing(angle, 1.2))
-    is_blank = found.is_blank & (found.until > 0)
-    assert is_blank.sum() > 0.5 * found.is_blank.sum()
+    assert (found.is_blank & (found.until > 0)).sum() > 0.5 * found.is_blank.sum()
 
 
 def test_depth_beside_a_step_is_no_surface() -> None:
@@ -137,8 +135,7 @@ def test_a_robot_that_returns_no_depth_is_hidden_by_something(is_drawn: bool) ->
     mask = replace(object_mask(dark), robot_depth=np.where(dark.depth <= 0, np.float32(0.5), np.float32(0.0)))
     (found,) = find_contradicted([(dark, mask)], is_drawn=is_drawn)
     points = points_of(found, dark, is_blank=True)
-    assert bool(len(points)) == is_drawn
-    assert not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6
+    assert bool(len(points)) == is_drawn and (not is_drawn or points[:, 2].min() > HEIGHT - 0.5 - 1e-6)
 
 
 @pytest.mark.parametrize(

@@ -116,15 +116,17 @@ def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
 )
 def test_a_hole_counts_where_the_camera_showed_it_before(before: RgbdFrame, counts: bool) -> None:
     """Between two people the background may be closed off for one image."""
-    found = list(unanswered_points(dark(), NOBODY, CONFIG, (before, object_mask(before))))
-    assert sum(map(len, found)) == (len(points_of(dark())) if counts else 0)
+    assert sum(map(len, list(unanswered_points(dark(), NOBODY, CONFIG, (before, object_mask(before)))))) == (
+        len(points_of(dark())) if counts else 0
+    )
 
 
 def test_a_hole_at_the_robot_before_does_not_count_either_after_a_resumed_run() -> None:
     """A restored mask has its kinds, and nothing rendered."""
     before = dark()
-    kinds = np.where(ROBOT_BESIDE > 0, np.uint8(PixelKind.ROBOT), object_mask(before).kinds)
-    restored = replace(object_mask(before), kinds=kinds)
+    restored = replace(
+        object_mask(before), kinds=np.where(ROBOT_BESIDE > 0, np.uint8(PixelKind.ROBOT), object_mask(before).kinds)
+    )
     assert not restored.robot_depth.any() and len(points_of(dark()))
     assert not list(unanswered_points(dark(), NOBODY, CONFIG, (before, restored)))
 
@@ -158,8 +160,9 @@ def test_steps_that_are_thinned_leave_it(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_fitted_scene_knows_it() -> None:
     fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
     fitter.step([dark_block(0.0)])
-    points = np.array([[0.0, 0.0, 0.5 * BLOCK], [0.0, 0.0, -0.5], [9.0, 0.0, 0.0]])
-    stamps_ns, classes = fitter.known_voxels().seen.look(points)
+    stamps_ns, classes = fitter.known_voxels().seen.look(
+        np.array([[0.0, 0.0, 0.5 * BLOCK], [0.0, 0.0, -0.5], [9.0, 0.0, 0.0]])
+    )
     assert stamps_ns.tolist() == [-1, -1, -1]
     assert classes.tolist() == [EvidenceClass.UNANSWERED, EvidenceClass.OUTSIDE, EvidenceClass.OUTSIDE]
 

@@ -22,8 +22,13 @@ CONFIG = SceneConfig(max_splats=400, first_iterations=6, iterations_per_step=3)
 
 
 def fitter(device: Memory | None) -> SceneFitter:
-    on = None if device is None else DeviceFit(device, CONFIG.max_splats)
-    return SceneFitter(CONFIG, OccupancyConfig(), WORKSPACE, threads=1, device=on)
+    return SceneFitter(
+        CONFIG,
+        OccupancyConfig(),
+        WORKSPACE,
+        threads=1,
+        device=None if device is None else DeviceFit(device, CONFIG.max_splats),
+    )
 
 
 def run(target: SceneFitter, first: int, last: int) -> list[AuditRow]:

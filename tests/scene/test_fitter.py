@@ -42,8 +42,9 @@ def on_top(target: SceneFitter) -> int:
 
 
 def posture(x: float) -> RobotPosture:
-    T = pose_at([x, 0.0, 0.0])
-    return RobotPosture(centers=np.array([[x, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=T[None])
+    return RobotPosture(
+        centers=np.array([[x, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=pose_at([x, 0.0, 0.0])[None]
+    )
 
 
 def test_a_floor_is_reconstructed_in_colour_and_depth() -> None:
@@ -100,8 +101,7 @@ def test_the_budget_is_never_exceeded_and_the_audit_adds_up(budget: int) -> None
     for k, block in enumerate([0.0, 0.2, 0.2, 0.0]):
         row = target.step([frame(k, block=block)])
         alive += row.added + row.relocated - sum(row.removed.values())
-        assert row.alive == alive == len(target.splats()) <= budget
-        assert list(row.removed) == list(REASONS)
+        assert row.alive == alive == len(target.splats()) <= budget and list(row.removed) == list(REASONS)
 
 
 def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> None:
@@ -120,8 +120,9 @@ def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> 
 
 def test_robot_splats_move_with_their_link() -> None:
     points = np.float32([[0.0, 0.0, 0.32], [0.12, 0.0, 0.2]])
-    moved = carry_splats(points, posture(0.0), posture(0.05))
-    assert np.allclose(moved, points + np.float32([0.05, 0.0, 0.0]), atol=1e-6)
+    assert np.allclose(
+        carry_splats(points, posture(0.0), posture(0.05)), points + np.float32([0.05, 0.0, 0.0]), atol=1e-6
+    )
 
 
 def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
@@ -176,8 +177,7 @@ def test_a_blank_or_sparse_start_costs_no_quality() -> None:
     speck.depth[28:33, 38:43] = 1.0
     for first in ([], [blank], [speck]):
         target = fitter()
-        rows = [target.step([seen]) for seen in (*first, frame(1), frame(2))]
-        scores.append(rows[-1].psnr)
+        scores.append([target.step([seen]) for seen in (*first, frame(1), frame(2))][-1].psnr)
     assert min(scores[1:]) > scores[0] - 2.0
 
 
@@ -202,8 +202,7 @@ def test_a_splat_that_drifts_into_the_air_is_gone_after_the_next_step() -> None:
     target = fitter()
     target.step([frame(0)])
     target.buffer.centers[np.flatnonzero(target.buffer.is_alive)[:20], 2] = 0.019
-    assert target.step([frame(1)]).removed["seen_through"] >= 10
-    assert target.splats().centers[:, 2].max() < 0.019
+    assert target.step([frame(1)]).removed["seen_through"] >= 10 and target.splats().centers[:, 2].max() < 0.019
 
 
 def test_colour_cameras_alone_fit_planted_points() -> None:

@@ -31,8 +31,7 @@ def views(depth: float = 0.1, *, is_flat: bool = False) -> list[RgbdFrame]:
 def test_what_the_camera_carries_is_found_and_the_world_is_not() -> None:
     """Surface at the depth of the world is not mounted."""
     mask, none = (mounted_pixels(views(depth), MIN_RANGE) for depth in (0.1, 0.8))
-    assert mask[2:18, 2:20].all()
-    assert not mask[30:].any() and not mask[:, 40:].any()
+    assert mask[2:18, 2:20].all() and not mask[30:].any() and not mask[:, 40:].any()
     assert not none.any()
 
 

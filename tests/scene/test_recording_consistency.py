@@ -34,8 +34,9 @@ def test_cameras_with_good_poses_agree() -> None:
 def test_a_pose_that_is_off_shows_as_that_much(offset: float, holds: bool) -> None:
     """Views of one camera are compared, too."""
     for cameras in (("cam0", "cam1"), ("camera", "camera")):
-        named = [replace(view, camera=name) for view, name in zip(views(z=offset), cameras, strict=True)]
-        (pair,) = agreements(named, *RANGE)
+        (pair,) = agreements(
+            [replace(view, camera=name) for view, name in zip(views(z=offset), cameras, strict=True)], *RANGE
+        )
         assert (pair.cameras, pair.holds, pair.median) == (cameras, holds, pytest.approx(abs(offset), abs=1e-6))
 
 

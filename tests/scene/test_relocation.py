@@ -28,8 +28,7 @@ def test_clones_keep_the_peak_and_the_opacity_summed_over_the_screen(opacity: fl
     before, after = blended(opacity, 0.01, 1), blended(a, r, count)
     assert after.max() == pytest.approx(before.max(), abs=1e-6)
     assert after.sum() == pytest.approx(before.sum(), rel=0.005)
-    largest_change = np.abs(after - before).max()
-    assert 0.01 * opacity * (count > 1 and opacity > 0.5) <= largest_change < 0.2 * opacity
+    assert 0.01 * opacity * (count > 1 and opacity > 0.5) <= np.abs(after - before).max() < 0.2 * opacity
 
 
 def test_the_one_dimensional_rule_would_lose_opacity() -> None:
@@ -50,12 +49,10 @@ def test_copies_take_dead_slots_and_start_without_moments() -> None:
     buffer.labels[1] = Label.HUMAN
     for array in (buffer.moments.first, buffer.moments.second, buffer.moments.num_steps):
         array[...] = 7
-    assert buffer.copy(np.array([1, 1, 1, 0]), np.full(5, 0.25), np.full(5, 0.02)) == 2
-    assert buffer.is_alive.all()
+    assert buffer.copy(np.array([1, 1, 1, 0]), np.full(5, 0.25), np.full(5, 0.02)) == 2 and buffer.is_alive.all()
     assert np.array_equal(buffer.centers[copies], np.tile([0, 1, 0], (3, 1)))
     assert buffer.opacities == pytest.approx(np.array([0.5, 0.25, 0.5, 0.25, 0.25]))
-    assert buffer.radii[copies] == pytest.approx(0.02)
-    assert (buffer.labels[copies] == Label.HUMAN).all()
+    assert buffer.radii[copies] == pytest.approx(0.02) and (buffer.labels[copies] == Label.HUMAN).all()
     assert not buffer.moments.first[copies].any() and not buffer.moments.num_steps[copies].any()
     assert (buffer.moments.first[[0, 2]] == 7).all()
 
@@ -68,8 +65,9 @@ def test_detail_is_seeded_where_the_colours_are_wrong_and_nowhere_else() -> None
     assert 10 <= len(seeds) <= 30 and seeds.radii == pytest.approx(pixel)
     u, v = seeds.centers[:, 0] / pixel + INTRINSICS.cx, -seeds.centers[:, 1] / pixel + INTRINSICS.cy
     assert ((u > 39.5) & (u < 59.5) & (v > 19.5) & (v < 29.5)).all()
-    apart = np.linalg.norm(seeds.centers[:, None] - seeds.centers[None], axis=2) + np.eye(len(seeds))
-    assert apart.min() >= 2 * pixel - 1e-6
+    assert (
+        np.linalg.norm(seeds.centers[:, None] - seeds.centers[None], axis=2) + np.eye(len(seeds))
+    ).min() >= 2 * pixel - 1e-6
 
 
 def test_pixels_are_drawn_as_numpy_draws_them() -> None:

@@ -67,8 +67,9 @@ def test_lengths_grow_with_the_depth_and_what_is_set_stays() -> None:
     lengths = made.scene.scale, made.scene.max_radius, made.scene.max_gap, made.scene.lambda_depth
     assert lengths == pytest.approx((3.0, 0.06, 3 * plain.max_gap, 1 / 3))
     assert made.scene.contact_radius == plain.contact_radius
-    ranges = made.occupancy.min_range, made.occupancy.max_range, made.occupancy.voxel
-    assert ranges == pytest.approx((0.6, 12.0, 0.05))
+    assert (made.occupancy.min_range, made.occupancy.max_range, made.occupancy.voxel) == pytest.approx(
+        (0.6, 12.0, 0.05)
+    )
 
 
 @pytest.mark.parametrize(("pixel", "expected"), [(0.004, 0.004), (0.01, 0.006)])
@@ -116,8 +117,7 @@ def test_beside_a_robot_the_sensors_error_alone_follows_from_the_recording() -> 
     noisy, given = replace(ROOM, noise=0.004), Config(occupancy=OccupancyConfig(depth_error=0.003))
     made = fitted_to(Config(), noisy, has_robot=True)
     assert made.occupancy == OccupancyConfig(depth_error=0.004) and made.scene == SceneConfig()
-    assert "4 mm at 1 m" in describe_scale(made, noisy)
-    assert fitted_to(given, noisy, has_robot=True) is given
+    assert "4 mm at 1 m" in describe_scale(made, noisy) and fitted_to(given, noisy, has_robot=True) is given
     assert fitted_to(CONFIG, ROOM, has_robot=True) is CONFIG
 
 

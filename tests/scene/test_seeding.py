@@ -35,13 +35,15 @@ NOTHING = np.zeros((0, 3), np.float32)
 
 
 def rendering(depth: Float32, opacity: float) -> Rendering:
-    full = np.full_like(depth, opacity)
-    return Rendering(color=np.zeros((*depth.shape, 3), np.float32), depth=depth * opacity, opacity=full)
+    return Rendering(
+        color=np.zeros((*depth.shape, 3), np.float32), depth=depth * opacity, opacity=np.full_like(depth, opacity)
+    )
 
 
 def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool | None = None) -> Bool:
-    everywhere = np.ones(seen.depth.shape, bool)
-    return add_mask(seen, rendering(shown, opacity), everywhere if mappable is None else mappable, CONFIG)
+    return add_mask(
+        seen, rendering(shown, opacity), np.ones(seen.depth.shape, bool) if mappable is None else mappable, CONFIG
+    )
 
 
 def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
@@ -50,8 +52,9 @@ def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
 
 def seeds_of(edge: float, beside: Float32 = NOTHING, config: SceneConfig = CONFIG) -> Seeds:
     """Seeds of the floor, one in each cube of a given edge."""
-    source = candidates(frame(), np.ones((60, 80), bool))
-    return seeds_at([source], beside, SeedDensity(edge=edge, tolerance=1e9), config)
+    return seeds_at(
+        [candidates(frame(), np.ones((60, 80), bool))], beside, SeedDensity(edge=edge, tolerance=1e9), config
+    )
 
 
 @pytest.mark.parametrize("lambda_mde", [1.0, 40.0])
@@ -87,8 +90,7 @@ def test_what_appears_in_front_is_asked_for_and_what_vanished_is_not() -> None:
 def test_invalid_depth_is_never_asked_for() -> None:
     seen = frame()
     seen.depth[:30] = 0.0
-    assert not mappable_in(seen)[:30].any()
-    assert not asked(seen, seen.depth, 0.0, mappable_in(seen))[:30].any()
+    assert not mappable_in(seen)[:30].any() and not asked(seen, seen.depth, 0.0, mappable_in(seen))[:30].any()
 
 
 def test_what_is_nearer_than_the_least_range_is_not_mapped() -> None:
@@ -173,8 +175,7 @@ def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
 @pytest.mark.parametrize("half", [0, 1])
 def test_the_two_halves_of_the_rows_are_looked_at_in_turn(half: int) -> None:
     seen, occupied = frame(), np.float32([[0, 0, 0.3], [0.1, 0, 0.3], [0.2, 0, 0.3], [0.3, 0, 0.3]])
-    bare = plain_splats([], 0.02)
-    centers = gap_seeds([(seen, seen.depth > 0)], occupied, 0.02, bare, CONFIG, half=half).centers
+    centers = gap_seeds([(seen, seen.depth > 0)], occupied, 0.02, plain_splats([], 0.02), CONFIG, half=half).centers
     in_air = centers[:, 2] > 0.2
     assert sorted(centers[in_air, 0].tolist()) == sorted(occupied[:, 0].tolist())
     rows = np.round(-centers[~in_air, 1] * 80.0 + 29.5)  # of the floor, 1 m below the camera
@@ -185,6 +186,5 @@ def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkey
     masks = [np.ones((60, 80), bool), np.zeros((60, 80), bool), np.eye(60, 80) > 0]
     assert thinning(masks) == 1 and thin_mask(masks[0], 1) is masks[0]
     monkeypatch.setattr("splatctrl_cli.config.fixed.SEED_MOST_PIXELS", 1000)
-    assert thinning(masks) == 5
-    assert [int(thin_mask(mask, 5).sum()) for mask in masks] == [960, 0, 12]
+    assert (thinning(masks), [int(thin_mask(mask, 5).sum()) for mask in masks]) == (5, [960, 0, 12])
     assert not (thin_mask(masks[2], 5) & ~masks[2]).any()

@@ -262,8 +262,9 @@ def shown(own: Sequence[int], depth: float = 1.0) -> tuple[RgbdFrame, SelfMask]:
     pixels = np.full((K.height, K.width), PixelKind.NOTHING, np.uint8)
     pixels[58:62, 78:82] = np.reshape(own, (4, 4))
     rendered = np.where(pixels == PixelKind.ROBOT, np.float32(depth), np.float32(0.0))
-    view = frame(np.full((K.height, K.width), depth))
-    return view, SelfMask(kinds=pixels, robot_depth=rendered, residuals={}, num_inside={})
+    return frame(np.full((K.height, K.width), depth)), SelfMask(
+        kinds=pixels, robot_depth=rendered, residuals={}, num_inside={}
+    )
 
 
 ROBOT, OBJECT = [PixelKind.ROBOT], [PixelKind.OBJECT]
@@ -301,8 +302,12 @@ def test_the_votes_of_random_pixels_are_those_of_the_reference() -> None:
         kinds = rng.choice(4 * [PixelKind.NOTHING] + OBJECT + 7 * ROBOT, (K.height, K.width)).astype(np.uint8)
         view = frame(rng.uniform(0.9, 1.1, kinds.shape))
         T = pose_at([turn, 0.0, 0.0], Rotation.from_euler("y", turn).as_matrix())
-        rendered = np.where(kinds == PixelKind.ROBOT, view.depth, np.float32(0.0))
-        mask = SelfMask(kinds=kinds, robot_depth=rendered, residuals={}, num_inside={})
+        mask = SelfMask(
+            kinds=kinds,
+            robot_depth=np.where(kinds == PixelKind.ROBOT, view.depth, np.float32(0.0)),
+            residuals={},
+            num_inside={},
+        )
         seen.append((replace(view, T_world_camera=T), mask))
     robots, objects = ([mask.kinds == kind for _, mask in seen] for kind in (PixelKind.ROBOT, PixelKind.OBJECT))
     origin = np.array([0.013, 0.0, 1.0])
@@ -331,8 +336,7 @@ def test_before_a_mesh_what_noise_may_explain_is_evidence_of_nothing(gap: float,
     depth = ball_depth()
     depth[54:66, 74:86] -= gap
     found = kinds(depth, drawn(), config=config)[54:66, 74:86]
-    assert ((found == PixelKind.OBJECT) == is_object).all()
-    assert (found == PixelKind.MIXED).any() != is_object
+    assert ((found == PixelKind.OBJECT) == is_object).all() and (found == PixelKind.MIXED).any() != is_object
 
 
 def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
@@ -391,8 +395,9 @@ def test_beside_a_nearer_link_depth_that_has_grown_over_a_link_is_not_its_residu
     """Stereo gives the rim of what is behind the depth of what is before."""
     plates = (("near", (0.0, 0.0, 0.8)), ("far", (0.08, 0.0, 0.9)))
     solids = [Shape(link=link, kind="box", size=(0.1, 0.1, 0.01), T_link_shape=pose_at(at)) for link, at in plates]
-    at_frame = {5: np.tile(np.eye(4), (2, 1, 1))}
-    posture = replace(robot(), surface=RobotSurface.from_parts(solids), T_world_surface=at_frame)
+    posture = replace(
+        robot(), surface=RobotSurface.from_parts(solids), T_world_surface={5: np.tile(np.eye(4), (2, 1, 1))}
+    )
     exact = masked(np.full(SHOWN.shape, np.inf), posture).robot_depth
     depth = np.where(exact > 0, exact, FLOOR)
     left = int(np.flatnonzero((exact > 0.85).any(axis=0))[0])

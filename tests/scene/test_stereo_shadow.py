@@ -45,8 +45,7 @@ def as_stereo(depth: Float32) -> Float32:
 )
 def test_all_that_a_pair_cannot_see_is_shadow(columns: tuple[slice, ...], turn: int) -> None:
     seen = as_stereo(plates(*columns))[:, ::turn]
-    assert (seen == 0).sum() >= 300
-    assert (find_shadows(seen, FOCAL) == (seen == 0)).all()
+    assert (seen == 0).sum() >= 300 and (find_shadows(seen, FOCAL) == (seen == 0)).all()
 
 
 def test_a_dark_thing_is_none_away_from_the_shadow() -> None:
@@ -86,8 +85,11 @@ def test_a_shadow_is_no_place_without_an_answer(is_dark: bool) -> None:
     depth = as_stereo(plates(slice(60, 90)))
     depth[12:32, 15:40] = np.where(is_dark, 0.0, depth[12:32, 15:40])
     lens = Intrinsics(fx=FOCAL, fy=FOCAL, cx=80.0, cy=20.0, width=WIDTH, height=HEIGHT)
-    nobody = np.zeros((HEIGHT, WIDTH), np.float32)
-    found = list(unanswered_points(plain_frame(depth, lens), nobody, OccupancyConfig(voxel=0.01)))
+    found = list(
+        unanswered_points(
+            plain_frame(depth, lens), np.zeros((HEIGHT, WIDTH), np.float32), OccupancyConfig(voxel=0.01)
+        )
+    )
     assert (sum(map(len, found)) > 0) == is_dark
 
 

@@ -24,8 +24,9 @@ def frames(*depths: float, camera: str = "cam0") -> list[RgbdFrame]:
 def steps(*cameras: Sequence[RgbdFrame], has_clock: bool = True) -> tuple[list[TimeStep], Counter[str]]:
     records = sorted((each for its in cameras for each in its), key=lambda each: each.stamp_ns)
     repeats: Counter[str] = Counter()
-    names = {each.camera for each in records}
-    return list(time_steps(iter(records), names, has_clock=has_clock, repeats=repeats)), repeats
+    return list(
+        time_steps(iter(records), {each.camera for each in records}, has_clock=has_clock, repeats=repeats)
+    ), repeats
 
 
 def test_depth_that_equals_the_image_before_is_left_out_and_counted_though_its_colour_is_new() -> None:

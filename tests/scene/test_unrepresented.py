@@ -51,8 +51,9 @@ def test_the_voxels_are_those_of_the_plain_reference(voxel: float) -> None:
     """And a ball contains its voxel."""
     grid, splats = occupied(voxel=voxel, share=0.2), some_splats()
     found, centers = reads_bare(grid, splats), grid.centers_of(grid.occupied_voxels()).astype(np.float64)
-    reach = representing_reach(CONFIG, voxel)
-    missing = unrepresented(centers, splats.centers.astype(float), splats.radii.astype(float), reach)
+    missing = unrepresented(
+        centers, splats.centers.astype(float), splats.radii.astype(float), representing_reach(CONFIG, voxel)
+    )
     assert 20 < missing.sum() < 0.9 * len(missing)
     assert found.centers.tolist() == centers[missing].astype(np.float32).tolist()
     assert found.radius == pytest.approx(0.5 * 3**0.5 * voxel)
@@ -125,8 +126,9 @@ def test_gap_filling_looks_at_all_that_is_bare_and_half_of_it_in_turn() -> None:
 
 
 def test_what_a_starved_budget_leaves_out_is_told_and_kept() -> None:
-    config = SceneConfig(max_splats=30, first_iterations=5, iterations_per_step=2)
-    fitter = SceneFitter(config, OccupancyConfig(), WORKSPACE)
+    fitter = SceneFitter(
+        SceneConfig(max_splats=30, first_iterations=5, iterations_per_step=2), OccupancyConfig(), WORKSPACE
+    )
     for k, block in enumerate((0.0, 0.2, 0.2)):
         row = fitter.step([frame(k, block=block), frame(k, block=block, y=0.02)])
     balls, alive = fitter.known_voxels().unrepresented, fitter.splats().centers
@@ -157,8 +159,7 @@ def moved(splats: SplatSet, scale: float, shift: float) -> SplatSet:
 def test_a_map_agrees_with_its_own_grid(fitter: SceneFitter) -> None:
     found = agreement(fitter.splats(), fitter.known_voxels())
     assert found.holds and found.on_surface > 0.95 and found.represented > 0.98
-    assert found.num_splats == len(fitter.splats())
-    assert found.num_voxels == len(fitter.occupancy.occupied_voxels())
+    assert (found.num_splats, found.num_voxels) == (len(fitter.splats()), len(fitter.occupancy.occupied_voxels()))
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1000.0, 0.0), (1.0, 3.0), (1.0, 0.1)])

@@ -44,8 +44,7 @@ def explain(grid: OccupancyMap, *frames: RgbdFrame, robot: RobotPosture = ROBOT)
 
 
 def class_at(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[EvidenceClass]:
-    steps = np.round((np.array(points) - grid.origin) / CONFIG.voxel).astype(int)
-    last = grid.last_seen[tuple(steps.T)].tolist()
+    last = grid.last_seen[tuple(np.round((np.array(points) - grid.origin) / CONFIG.voxel).astype(int).T)].tolist()
     return [EvidenceClass[Unseen(each).name] if each >= min(Unseen) else EvidenceClass.FREE for each in last]
 
 
@@ -103,7 +102,10 @@ def test_the_robots_body_sweeps_and_what_sticks_out_of_it_does_not(is_drawn: boo
     """Its spheres are 5 cm larger than what is drawn of it."""
     large = replace(ROBOT, radii=np.array([RADIUS + 0.05]))
     if is_drawn:
-        surface = RobotSurface.from_balls(MIDDLE[None], np.array([RADIUS]))
-        large = replace(large, surface=surface, T_world_surface={0: np.eye(4)[None]})
+        large = replace(
+            large,
+            surface=RobotSurface.from_balls(MIDDLE[None], np.array([RADIUS])),
+            T_world_surface={0: np.eye(4)[None]},
+        )
     expected = EvidenceClass.HIDDEN_BY_ARM if is_drawn else EvidenceClass.SWEPT
     assert class_at(explained(robot_and_floor(), robot=large), (0.0, 0.0, 0.175)) == [expected]

@@ -76,8 +76,7 @@ class OnProcessor:
         self, seen: TargetView, weights: LossWeights, planes: Float32 | None = None
     ) -> tuple[Float32, LossTerms]:
         out = np.empty_like(self.planes)
-        terms = ImageLoss(1).evaluate(self.planes if planes is None else planes, seen, weights, out)
-        return out, terms
+        return out, ImageLoss(1).evaluate(self.planes if planes is None else planes, seen, weights, out)
 
     def gradients(self, plane_gradients: Float32, regulariser: float) -> Float32:
         """By the parameters (N, 8), regulariser included, of the splats that are seen."""
@@ -93,5 +92,6 @@ class OnProcessor:
         return out
 
     def step(self, plane_gradients: Float32, state: Moments, settings: OptimiserSettings, seed: int) -> None:
-        by_footprint = self.raster.backward(self.planes, plane_gradients)
-        optimiser_step(self.raster, by_footprint, self.parameters, state, settings, seed)
+        optimiser_step(
+            self.raster, self.raster.backward(self.planes, plane_gradients), self.parameters, state, settings, seed
+        )

@@ -86,8 +86,7 @@ def test_exact_distances_of_a_grid_are_those_of_the_processor(where: str, device
     centers, radii = (values[of.source[baked.entry.ravel()]] for values in cloud(NUM))
     mine = np.linalg.norm(points - centers, axis=1) - radii
     np.testing.assert_allclose(mine, expected.ravel(), rtol=0, atol=1e-6)  # a tie may go either way
-    same = np.abs(baked.gradient - gradient).max(axis=-1) < 1e-4
-    assert same.mean() > 0.999
+    assert (np.abs(baked.gradient - gradient).max(axis=-1) < 1e-4).mean() > 0.999
 
 
 @pytest.mark.parametrize("length", [0.005, 0.02, 0.1])
@@ -120,8 +119,7 @@ def test_a_truncation_raises_a_distance_by_no_more(device: Memory) -> None:
     span, _ = span_of(of, NEAR, 0.02)
     for name in KINDS:
         baked = device_field(device, of, config, (name,), is_single=True).bake(span, ())
-        exact = device_field(device, of, EXACT, (name,), is_single=True).bake(span, ())
-        error = baked.distance - exact.distance
+        error = baked.distance - device_field(device, of, EXACT, (name,), is_single=True).bake(span, ()).distance
         assert error.max() < config.truncation
         assert (error != 0.0).any()  # something is left out
         assert error.min() > -2e-6
@@ -137,8 +135,7 @@ def test_the_smaller_distance_is_taken_with_its_gradient_and_what_was_asked_is_c
     assert 0.1 < is_smooth.mean() < 0.99
     np.testing.assert_array_equal(baked.distance, np.minimum(baked.hard, baked.kernels["se"]))
     clear = (np.abs(np.nan_to_num(smooth, nan=9.0) - hard) > 1e-4) & ~(smooth < 0.0)
-    expected = np.where(is_smooth[..., None], smooth_slope, slope)
-    assert np.abs(baked.gradient - expected)[clear].max() < 5e-4
+    assert np.abs(baked.gradient - np.where(is_smooth[..., None], smooth_slope, slope))[clear].max() < 5e-4
     assert abs(baked.counts["se"][0] - int(np.isnan(smooth).sum())) <= 2
     over = np.nan_to_num(smooth, nan=0.0) > hard + RESOLUTION
     assert abs(baked.counts["se"][1] - int(over.sum())) <= 0.01 * over.size
@@ -152,8 +149,7 @@ def test_points_are_answered_as_by_the_processor(num: int, device: Memory) -> No
     found = device_field(device, of, config).query(points, of.anchor, ALL)
     hard, _ = SphereField(of).query(points)
     np.testing.assert_allclose(found.hard, hard, rtol=1e-5, atol=1e-6)
-    nearest = SphereField(of).nearest(points)
-    assert np.mean(of.source[found.entry] == nearest) > 0.99
+    assert np.mean(of.source[found.entry] == SphereField(of).nearest(points)) > 0.99
     for name, kind in KINDS.items():
         raw, raw_slope = kind(of, config).query_raw(points)
         raw[np.isnan(raw)] = hard[np.isnan(raw)]
@@ -183,8 +179,7 @@ def test_planes_in_parts_have_the_bytes_of_the_whole(device: Memory) -> None:
     whole = field.bake(span_of(of, NEAR, 0.02)[0], ALL)
     parts = [field.bake(span_of(of, NEAR, 0.02, *planes)[0], ALL) for planes in ((0, 8), (8, None))]
     for name in ("hard", "distance", "gradient"):
-        joined = np.concatenate([getattr(part, name) for part in parts])
-        np.testing.assert_array_equal(joined, getattr(whole, name))
+        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
 def test_the_order_of_threads_changes_no_byte() -> None:

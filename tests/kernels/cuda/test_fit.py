@@ -23,8 +23,7 @@ FORWARD, BACKWARD = 1e-5, 1e-4  # largest error allowed, relative to the whole
 
 def error(got: Float32, want: Float32) -> float:
     """|got - want| / |want|, over everything; not a number where anything is not."""
-    difference = got.astype(np.float64) - want
-    return float(np.linalg.norm(difference) / max(np.linalg.norm(want.astype(np.float64)), 1e-12))
+    return float(np.linalg.norm(got.astype(np.float64) - want) / max(np.linalg.norm(want.astype(np.float64)), 1e-12))
 
 
 def derivatives(fit: DeviceFit, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
@@ -175,12 +174,10 @@ def test_iterations_equal_those_of_the_processor(device: Memory) -> None:
     terms = fit.run(schedule, WEIGHTS, SETTINGS, (5 << 32) + 3)
     got, got_state = np.empty_like(p), moments(len(p))
     fit.take(got, got_state)
-    assert np.array_equal(got_state.num_steps, state.num_steps)
-    assert error(got_state.first, state.first) < BACKWARD
+    assert np.array_equal(got_state.num_steps, state.num_steps) and error(got_state.first, state.first) < BACKWARD
     assert error(got, on_processor) < BACKWARD
     assert error(got - p, on_processor - p) < 1e-2  # Adam divides by what is nearly zero
-    assert set(terms) == {0, 1}
-    assert values(terms[0]) == pytest.approx(values(want_terms), rel=1e-4)
+    assert (set(terms), values(terms[0])) == ({0, 1}, pytest.approx(values(want_terms), rel=1e-4))
 
 
 def run_bytes(device: Memory, p: Float32, **sizes: int) -> bytes:
@@ -221,8 +218,7 @@ def test_splats_out_of_view_keep_their_bytes(device: Memory) -> None:
     fit.run([0], WEIGHTS, SETTINGS, 1)
     got, state = np.empty_like(p), moments(len(p))
     fit.take(got, state)
-    assert unseen.sum() > 10
-    assert np.array_equal(got[unseen], p[unseen])
+    assert unseen.sum() > 10 and np.array_equal(got[unseen], p[unseen])
     assert np.array_equal(state.num_steps == 0, unseen)
 
 
@@ -265,8 +261,7 @@ def test_lists_that_outgrow_the_memory_are_an_error_that_leaves_nothing_behind()
     free = DeviceFit(EmulatedDevice(), len(p))
     free.close()
     assert not free.device.sizes
-    just = bytes_needed(len(p), [(20, 24)]) + 10_000
-    fit = fitted(EmulatedDevice(limit=just), p, view, target(24, 20))
+    fit = fitted(EmulatedDevice(limit=bytes_needed(len(p), [(20, 24)]) + 10_000), p, view, target(24, 20))
     with pytest.raises(OutOfMemory, match=r"out of memory: 2500 splats .*3 MB are free"):
         fit.planes(0)
     fit.close()
