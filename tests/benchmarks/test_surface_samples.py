@@ -4,7 +4,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
 from splatctrl_cli.robot.link_meshes import MeshDistance
-from tests.robot.test_mesh_distance import box_distance, box_mesh
+from tests.robot.test_link_meshes import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)
 

@@ -28,7 +28,7 @@ from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, Intrinsics, 
 from tests.evaluate.test_views import wall_frame
 from tests.plain import plain_frame
 from tests.refused import expect_refusal
-from tests.robot.test_mesh_distance import box_distance
+from tests.robot.test_link_meshes import box_distance
 
 TRUTH = np.array([0.01, 0.015, 0.03, 0.07, 0.15, 0.3, -0.01])
 SOME = np.array([True, False, True, True, True, True, True])

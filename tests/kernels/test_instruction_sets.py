@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.field.clusters import Spheres
-from splatctrl_cli.kernels import arithmetic, native
+from splatctrl_cli.kernels import arithmetic, native, num_threads
 from splatctrl_cli.kernels import field as fields
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
@@ -86,3 +86,14 @@ def test_avx2_and_avx512_give_the_same_bytes() -> None:
     }
     assert of["v3"] == of["auto"]
     assert len(of["v3"].split()) == 5
+
+
+@pytest.mark.parametrize(
+    ("processors", "requested", "given"),
+    [(2, 0, 2), (2, 1, 1), (2, 16, 16), (2, 9999, 16), (64, 0, 64), (64, 9999, 64)],
+)
+def test_threads_are_at_most_16_or_one_per_processor(
+    monkeypatch: pytest.MonkeyPatch, processors: int, requested: int, given: int
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(processors)))
+    assert num_threads(requested) == given
