@@ -7,6 +7,7 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.baker import Baker, Changes, changed_blocks, counts_after
 from splatctrl_cli.field.grid_cells import GridLayout
+from splatctrl_cli.field.slabs import bake_planes
 from splatctrl_cli.records import Box, Label, SplatSet
 from tests.field.scenes import cloud, splat_set
 
@@ -63,9 +64,7 @@ def update_and_compare(
         for splats, num in ((before, 2), (after, 2), (after, 1))
     )
     num = layout.shape[0]
-    arrays, expected = old.allocate(num), full.allocate(num)
-    old.bake(0, num, arrays)
-    full.bake(0, num, expected)
+    arrays, expected = (bake_planes(baker, 0, num) for baker in (old, full))
     counts = dict(old.counts)
     changes = changed_blocks(before, old, after, new)
     assert changes.mask is not None

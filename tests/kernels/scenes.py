@@ -4,7 +4,7 @@ import numpy as np
 
 from splatctrl_cli.geometry import invert_transform, look_at
 from splatctrl_cli.kernels import points as kernels
-from splatctrl_cli.kernels.raster import Float32, Float64, Rasteriser, pack_camera
+from splatctrl_cli.kernels.raster import Float32, Float64, Moments, Rasteriser, TargetView, pack_camera
 from splatctrl_cli.records import Bool
 
 STILL = np.eye(4)
@@ -24,6 +24,24 @@ def splats(count: int = 60, seed: int = 0) -> Arrays:
     radii = rng.uniform(0.01, 0.08, count).astype(np.float32)
     opacities = rng.uniform(0.02, 0.98, count).astype(np.float32)
     return centers, radii, opacities, rng.uniform(0, 1, (count, 3)).astype(np.float32)
+
+
+def moments(count: int) -> Moments:
+    """Of splats that have not moved."""
+    return Moments(
+        first=np.zeros((count, 8), np.float32),
+        second=np.zeros((count, 8), np.float32),
+        num_steps=np.zeros(count, np.uint32),
+    )
+
+
+def target(width: int = 83, height: int = 61, seed: int = 0) -> TargetView:
+    """A noisy image, depth with holes, and a tenth of the pixels that do not count."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
+    depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
+    counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
+    return TargetView(color=rng.integers(0, 256, (3, height, width), np.uint8), depth=depth, counted=counted)
 
 
 def visible(raster: Rasteriser) -> Bool:

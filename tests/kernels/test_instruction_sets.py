@@ -14,7 +14,6 @@ from splatctrl_cli.kernels import field as fields
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
     LossWeights,
-    Moments,
     OptimiserSettings,
     Rasteriser,
     TargetView,
@@ -22,7 +21,7 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
 )
 from tests.field.scenes import cloud, queries
-from tests.kernels.scenes import camera, points_bytes, splats
+from tests.kernels.scenes import camera, moments, points_bytes, splats
 
 
 def fit_bytes(width: int, height: int) -> bytes:
@@ -41,18 +40,14 @@ def fit_bytes(width: int, height: int) -> bytes:
     terms = ImageLoss(2).evaluate(planes, target, weights, by_planes)
     gradients = raster.backward(planes, by_planes)
     parameters = np.column_stack([centers, np.log(radii), colors, np.log(opacities / (1 - opacities))])
-    moments = Moments(
-        first=np.zeros((count, 8), np.float32),
-        second=np.zeros((count, 8), np.float32),
-        num_steps=np.zeros(count, np.uint32),
-    )
+    state = moments(count)
     settings = OptimiserSettings(
         lr_center=2e-4, lr_log_radius=6e-3, lr_color=1e-2, lr_logit_opacity=5e-2, regulariser=1e-6, noise=5e5,
         min_opacity=0.1, min_radius=1e-3, max_radius=0.1, radius_depth=0.8,
     )  # fmt: skip
     moved = np.ascontiguousarray(parameters, np.float32)
-    optimiser_step(raster, gradients, moved, moments, settings, 7)
-    arrays = planes, by_planes, gradients, moved, moments.first, moments.second
+    optimiser_step(raster, gradients, moved, state, settings, 7)
+    arrays = planes, by_planes, gradients, moved, state.first, state.second
     return b"".join(array.tobytes() for array in arrays) + repr(terms).encode()
 
 

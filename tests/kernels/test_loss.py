@@ -7,18 +7,15 @@ import pytest
 import torch
 
 from splatctrl_cli.kernels.raster import Float32, ImageLoss, LossTerms, LossWeights, TargetView
+from tests.kernels.scenes import target
 from tests.reference import loss as reference
 
 WEIGHTS = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=False)
 
 
-def images(height: int = 29, width: int = 43, seed: int = 0) -> tuple[Float32, TargetView]:
-    rng = np.random.default_rng(seed)
-    planes = rng.uniform(0.05, 1.0, (5, height, width)).astype(np.float32)
-    depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
-    depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
-    counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
-    return planes, TargetView(color=rng.integers(0, 256, (3, height, width), np.uint8), depth=depth, counted=counted)
+def images(height: int = 29, width: int = 43) -> tuple[Float32, TargetView]:
+    planes = np.random.default_rng(9).uniform(0.05, 1.0, (5, height, width)).astype(np.float32)
+    return planes, target(width, height)
 
 
 def evaluated(planes: Float32, view: TargetView, weights: LossWeights, threads: int = 1) -> tuple[LossTerms, Float32]:

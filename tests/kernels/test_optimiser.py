@@ -12,6 +12,7 @@ from splatctrl_cli.kernels.raster import (
     pack_camera,
     unpack_parameters,
 )
+from tests.kernels.scenes import moments
 from tests.reference import raster as reference
 
 RATES = [2e-4] * 3 + [5e-3] + [3e-3] * 3 + [2e-2]
@@ -40,14 +41,6 @@ def splats(count: int = 30) -> Float32:
     p[:, 4:7] = rng.uniform(0.2, 0.8, (count, 3))
     p[:, 7] = rng.uniform(-1.5, 1.5, count)
     return p
-
-
-def moments(count: int) -> Moments:
-    return Moments(
-        first=np.zeros((count, 8), np.float32),
-        second=np.zeros((count, 8), np.float32),
-        num_steps=np.zeros(count, np.uint32),
-    )
 
 
 def stepped(p: Float32, state: Moments, chosen: OptimiserSettings, upstream: Float32, seed: int = 1) -> Rasteriser:

@@ -20,15 +20,6 @@ def tensors(arrays: Arrays) -> list[torch.Tensor]:
     return [torch.tensor(a.astype(np.float64), requires_grad=True) for a in arrays]
 
 
-def test_planes_equal_the_reference() -> None:
-    arrays, view = splats(), camera()
-    planes = rendered(arrays, view)[1]
-    expected = reference.render(torch.tensor(view), *tensors(arrays)).detach().numpy()
-    # A pixel whose alpha lies within rounding of 1/255 may fall on either side of the cut.
-    assert np.abs(planes - expected).max() < 1.2 / 255 and np.median(np.abs(planes - expected)) < 1e-6
-    assert np.mean(np.abs(planes - expected) > 1e-5) < 1e-3
-
-
 def test_planes_begin_at_a_whole_cache_line() -> None:
     assert all(empty_planes(7, width).ctypes.data % 64 == 0 for width in range(1, 40))
 
@@ -44,8 +35,8 @@ def opaque_layers() -> Arrays:
     )
 
 
-@pytest.mark.parametrize(("arrays", "is_opaque"), [(splats(40, seed=3), False), (opaque_layers(), True)])
-def test_gradients_equal_autograd_of_the_reference(arrays: Arrays, is_opaque: bool) -> None:
+@pytest.mark.parametrize(("arrays", "is_opaque"), [(splats(), False), (opaque_layers(), True)])
+def test_planes_and_gradients_equal_the_reference_and_its_autograd(arrays: Arrays, is_opaque: bool) -> None:
     raster, planes = rendered(arrays, camera())
     assert (np.mean(planes[4] > 1 - 1e-3) > 0.5) == is_opaque
     upstream = np.random.default_rng(1).normal(size=planes.shape).astype(np.float32)
@@ -55,7 +46,8 @@ def test_gradients_equal_autograd_of_the_reference(arrays: Arrays, is_opaque: bo
     expected = reference.render(torch.tensor(camera()), *leaves)
     expected.backward(torch.tensor(upstream.astype(np.float64)))
     difference = np.abs(planes - expected.detach().numpy())
-    assert difference.max() < 1.2 / 255 and np.mean(difference > 1e-5) < 1e-3
+    # A pixel whose alpha lies within rounding of 1/255 may fall on either side of the cut.
+    assert difference.max() < 1.2 / 255 and np.median(difference) < 1e-6 and np.mean(difference > 1e-5) < 1e-3
     for got, leaf in zip([g_centers, g_radii, gradients[:, 6], gradients[:, 7:]], leaves, strict=True):
         want = leaf.grad.numpy()
         assert np.abs(got - want).max() < 2e-3 * np.abs(want).max()

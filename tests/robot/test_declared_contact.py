@@ -33,20 +33,17 @@ def declared(tmp_path: Path, text: str = GOOD) -> Declarations:
 def test_a_carried_box_holds_points_of_its_link_while_it_is_carried(tmp_path: Path) -> None:
     entries = declared(tmp_path)
     points = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.4]])
-    assert entries.is_carried("hand", points, 2.0).tolist() == [True, False]
-    assert not entries.is_carried("arm", points, 2.0).any()
-    assert not entries.is_carried("hand", points, 2.6).any()
-    assert [link for link, _ in entries.carried_at(1.0)] == ["hand"]
-    assert entries.carried_at(0.9) == []
+    for link, time, expected in (("hand", 2.0, [True, False]), ("arm", 2.0, [False] * 2), ("hand", 2.6, [False] * 2)):
+        assert entries.is_carried(link, points, time).tolist() == expected
+    assert [[link for link, _ in entries.carried_at(time)] for time in (1.0, 0.9)] == [["hand"], []]
 
 
 def test_a_contact_is_expected_at_its_link_place_and_time_alone(tmp_path: Path) -> None:
     entries = declared(tmp_path)
     place = np.array([0.5, 0.0, 0.1])
     assert entries.find_expected("hand", place, 3.5).reason == "the peg goes into its hole"
-    assert entries.find_expected("arm", place, 3.5) is None
-    assert entries.find_expected("hand", place + 0.2, 3.5) is None
-    assert entries.find_expected("hand", place, 4.5) is None
+    for link, at, time in (("arm", place, 3.5), ("hand", place + 0.2, 3.5), ("hand", place, 4.5)):
+        assert entries.find_expected(link, at, time) is None
 
 
 def test_what_nothing_used_is_known(tmp_path: Path) -> None:

@@ -21,32 +21,19 @@ from tests.refused import expect_refusal
 LENS = Intrinsics(fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240)
 EYES = ((1.1, 0.1, 0.6), (-0.2, -1.1, 0.5), (0.2, 1.0, 0.9))
 LINKS = ("base", "arm")
+ALONG = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])  # the axis of a shape lies along x
+BASE = Shape(link="base", kind="box", size=(0.16, 0.16, 0.3), T_link_shape=pose_at((0, 0, 0.15)))
+ARM = Shape(link="arm", kind="capsule", size=(0.045, 0.3), T_link_shape=pose_at((0.2, 0.0, 0.0), ALONG))
 BRACKET = Shape(link="arm", kind="box", size=(0.03, 0.05, 0.04), T_link_shape=pose_at((0.2, 0.0, 0.06)))
-ROBOT = RobotSurface.from_parts(
-    [
-        Shape(link="base", kind="box", size=(0.16, 0.16, 0.3), T_link_shape=pose_at((0, 0, 0.15))),
-        Shape(
-            link="arm",
-            kind="capsule",
-            size=(0.045, 0.3),
-            T_link_shape=pose_at((0.2, 0.0, 0.0), np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])),
-        ),
-    ],
-    fixed=("base",),
-)
+ROBOT = RobotSurface.from_parts([BASE, ARM], fixed=("base",))
 
 
 def shapes(*, has_bracket: bool = True) -> list[Shape]:
     """What is truly there: the robot, its bracket, a wall, a box near the arm's path, and one beside the base."""
     return [
-        Shape(link="base", kind="box", size=(0.16, 0.16, 0.3), T_link_shape=pose_at((0, 0, 0.15))),
+        BASE,
         Shape(link="base", kind="box", size=(0.05, 0.05, 0.1), T_link_shape=pose_at((0.12, 0.0, 0.05))),
-        Shape(
-            link="arm",
-            kind="capsule",
-            size=(0.045, 0.3),
-            T_link_shape=pose_at((0.2, 0.0, 0.0), np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])),
-        ),
+        ARM,
         *([BRACKET] if has_bracket else []),
         Shape(link="world", kind="box", size=(0.02, 3.0, 3.0), T_link_shape=pose_at((-0.6, 0.0, 0.5))),
         Shape(link="world", kind="box", size=(3.0, 3.0, 0.02), T_link_shape=pose_at((0.0, 0.0, -0.01))),
@@ -104,26 +91,13 @@ def test_a_bracket_that_the_urdf_lacks_is_found_within_a_voxel_and_nothing_else_
     assert TriangleTree(triangles).closest(np.array(sides))[0].max() < VOXEL
 
 
-def test_a_cable_narrower_than_a_thinned_pixel_is_found_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each fourth pixel says which link is seen; depth is read at each."""
-    monkeypatch.setattr(self_fusion, "WIDE", 80)
-    along = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
-    cable = Shape(link="arm", kind="capsule", size=(0.005, 0.2), T_link_shape=pose_at((0.2, 0.0, 0.065), along))
-    ((link, triangles),) = learn(
-        ROBOT, LINKS, *recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), cable]))
-    ).pieces()
-    assert link == "arm"
-    assert RobotSurface.from_parts([cable]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < 2 * VOXEL
-    assert np.ptp(triangles[..., 0]) > 0.19
+CABLE = Shape(link="arm", kind="capsule", size=(0.005, 0.2), T_link_shape=pose_at((0.2, 0.0, 0.065), ALONG))
 
 
 def test_a_cable_that_one_of_three_cameras_looks_past_is_found() -> None:
     """A laser measures what is behind a thin cable; the other two outvote it."""
-    along = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
-    cable = Shape(link="arm", kind="capsule", size=(0.005, 0.2), T_link_shape=pose_at((0.2, 0.0, 0.065), along))
-    bare = RobotSurface.from_parts(shapes(has_bracket=False))
-    frames, poses_seen = recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), cable]))
-    past, _ = recorded(MOVES, bare)
+    frames, poses_seen = recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), CABLE]))
+    past, _ = recorded(MOVES, RobotSurface.from_parts(shapes(has_bracket=False)))
     mixed = [other if one.camera == "0" else one for one, other in zip(frames, past, strict=True)]
     ((link, triangles),) = learn(ROBOT, LINKS, mixed, poses_seen).pieces()
     assert link == "arm" and np.ptp(triangles[..., 0]) > 0.19
@@ -135,7 +109,7 @@ def test_what_two_fingers_hold_between_them_is_robot() -> None:
         Shape(link=link, kind="box", size=(0.06, 0.02, 0.06), T_link_shape=pose_at((0.4, y, 0.0)))
         for link, y in (("left", 0.05), ("right", -0.05))
     ]
-    robot = RobotSurface.from_parts([*shapes(has_bracket=False)[:1], shapes()[2], *fingers], fixed=("base",))
+    robot = RobotSurface.from_parts([BASE, ARM, *fingers], fixed=("base",))
     held = Shape(link="arm", kind="box", size=(0.05, 0.08, 0.16), T_link_shape=pose_at((0.41, 0.0, 0.0)))
     frames, at = recorded(MOVES, RobotSurface.from_parts([*shapes(has_bracket=False), *fingers, held]), robot=robot)
     found = learn(robot, robot.links, frames, at).pieces()
@@ -174,15 +148,6 @@ SLIGHT = [(float(turn), 0.0) for turn in np.linspace(-0.08, 0.08, 11)]  # 64 mm 
 BESIDE = Shape(link="world", kind="box", size=(0.1, 0.05, 0.5), T_link_shape=pose_at((0.36, 0.13, 0.25)))
 
 
-def test_a_tool_at_the_tip_of_a_link_that_moves_slightly_is_found() -> None:
-    tool = Shape(link="arm", kind="box", size=(0.05, 0.04, 0.06), T_link_shape=pose_at((0.34, 0.0, 0.07)))
-    ((link, triangles),) = learn(
-        ROBOT, LINKS, *recorded(SLIGHT, RobotSurface.from_parts([*shapes(has_bracket=False), tool, BESIDE]))
-    ).pieces()
-    assert link == "arm"
-    assert RobotSurface.from_parts([tool]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < 2 * VOXEL
-
-
 @pytest.mark.parametrize("beside", [[PLATE], [ROD], [BESIDE], [BRACKET]], ids=["plate", "rod", "box", "bracket"])
 def test_what_a_slight_motion_cannot_tell_from_the_scene_is_no_part(beside: list[Shape]) -> None:
     """The bracket moves with the arm, but by less than 40 mm."""
@@ -195,14 +160,34 @@ def test_what_a_slight_motion_cannot_tell_from_the_scene_is_no_part(beside: list
     )
 
 
-def test_a_rib_goes_on_beside_the_joint_where_it_hardly_moves() -> None:
-    rib = Shape(link="arm", kind="box", size=(0.34, 0.02, 0.02), T_link_shape=pose_at((0.17, 0.0, 0.06)))
-    truth = RobotSurface.from_parts([*shapes(has_bracket=False), rib])
-    frames, at = recorded([(0.25 * np.sin(0.5 * k), 0.12 * np.sin(0.9 * k + 1.0)) for k in range(15)], truth)
-    ((link, triangles),) = learn(ROBOT, LINKS, frames, at).pieces()
+TOOL = Shape(link="arm", kind="box", size=(0.05, 0.04, 0.06), T_link_shape=pose_at((0.34, 0.0, 0.07)))
+RIB = Shape(link="arm", kind="box", size=(0.34, 0.02, 0.02), T_link_shape=pose_at((0.17, 0.0, 0.06)))
+NEAR_THE_JOINT = [(0.25 * np.sin(0.5 * k), 0.12 * np.sin(0.9 * k + 1.0)) for k in range(15)]
+
+
+@pytest.mark.parametrize(
+    ("part", "beside", "moves", "wide", "ends"),
+    [
+        pytest.param(CABLE, [], MOVES, 80, (0.095, 0.305), id="a cable narrower than a thinned pixel"),
+        pytest.param(TOOL, [BESIDE], SLIGHT, self_fusion.WIDE, (0.315, 0.365), id="a tool that moves slightly"),
+        pytest.param(RIB, [], NEAR_THE_JOINT, self_fusion.WIDE, (0.0, 0.34), id="a rib from the joint on"),
+    ],
+)
+def test_a_part_of_the_arm_is_found_from_end_to_end(
+    monkeypatch: pytest.MonkeyPatch,
+    part: Shape,
+    beside: list[Shape],
+    moves: list[tuple[float, float]],
+    wide: int,
+    ends: tuple[float, float],
+) -> None:
+    """Each fourth pixel of a wide image says which link is seen; depth is read at each."""
+    monkeypatch.setattr(self_fusion, "WIDE", wide)
+    truth = RobotSurface.from_parts([*shapes(has_bracket=False), part, *beside])
+    ((link, triangles),) = learn(ROBOT, LINKS, *recorded(moves, truth)).pieces()
     assert link == "arm"
-    assert triangles[..., 0].min() == pytest.approx(0.0, abs=2 * VOXEL)
-    assert triangles[..., 0].max() == pytest.approx(0.34, abs=2 * VOXEL)
+    assert RobotSurface.from_parts([part]).distance(np.eye(4)[None], triangles.reshape(-1, 3)).max() < 2 * VOXEL
+    assert (triangles[..., 0].min(), triangles[..., 0].max()) == pytest.approx(ends, abs=2 * VOXEL)
 
 
 def test_the_pieces_belong_to_the_surface_that_is_rendered_and_measured() -> None:

@@ -40,10 +40,8 @@ def rendering(depth: Float32, opacity: float) -> Rendering:
     )
 
 
-def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool | None = None) -> Bool:
-    return add_mask(
-        seen, rendering(shown, opacity), np.ones(seen.depth.shape, bool) if mappable is None else mappable, CONFIG
-    )
+def asked(seen: RgbdFrame, shown: Float32, opacity: float, mappable: Bool) -> Bool:
+    return add_mask(seen, rendering(shown, opacity), mappable, CONFIG)
 
 
 def mappable_in(seen: RgbdFrame, *least: float) -> Bool:
@@ -71,20 +69,23 @@ def test_seeded_pixels_are_those_of_the_reference(lambda_mde: float) -> None:
     assert 100 < np.count_nonzero(expected) < 0.95 * np.count_nonzero(mappable)
 
 
-def test_an_empty_map_asks_for_every_mappable_pixel() -> None:
-    seen = frame()
-    mappable = mappable_in(seen)
-    assert mappable.any() and np.array_equal(asked(seen, seen.depth, 0.0, mappable), mappable)
+FLOOR, BLOCK = frame(), frame(block=0.2)
+EVERYWHERE = np.ones((60, 80), bool)
 
 
-def test_a_perfect_map_asks_for_nothing() -> None:
-    assert not asked(frame(), frame().depth, 0.9).any()
-
-
-def test_what_appears_in_front_is_asked_for_and_what_vanished_is_not() -> None:
-    floor, block = frame(), frame(block=0.2)
-    assert np.array_equal(asked(block, floor.depth, 0.9), block.depth < 0.9)
-    assert not asked(floor, block.depth, 0.9).any()
+@pytest.mark.parametrize(
+    ("seen", "shown", "opacity", "mappable", "expected"),
+    [
+        pytest.param(FLOOR, FLOOR, 0.0, mappable_in(FLOOR), mappable_in(FLOOR), id="all of an empty map"),
+        pytest.param(FLOOR, FLOOR, 0.9, EVERYWHERE, ~EVERYWHERE, id="nothing of a perfect map"),
+        pytest.param(BLOCK, FLOOR, 0.9, EVERYWHERE, BLOCK.depth < 0.9, id="what appears in front"),
+        pytest.param(FLOOR, BLOCK, 0.9, EVERYWHERE, ~EVERYWHERE, id="not what vanished"),
+    ],
+)
+def test_what_the_map_lacks_is_asked_for(
+    seen: RgbdFrame, shown: RgbdFrame, opacity: float, mappable: Bool, expected: Bool
+) -> None:
+    assert np.array_equal(asked(seen, shown.depth, opacity, mappable), expected) and mappable.any()
 
 
 def test_invalid_depth_is_never_asked_for() -> None:

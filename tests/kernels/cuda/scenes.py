@@ -46,22 +46,6 @@ def parameters(count: int, radius: float = 0.03, seed: int = 0) -> Float32:
     return p
 
 
-def moments(count: int) -> Moments:
-    return Moments(
-        first=np.zeros((count, 8), np.float32),
-        second=np.zeros((count, 8), np.float32),
-        num_steps=np.zeros(count, np.uint32),
-    )
-
-
-def target(width: int = 83, height: int = 61, seed: int = 0) -> TargetView:
-    rng = np.random.default_rng(seed)
-    depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
-    depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
-    counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
-    return TargetView(color=rng.integers(0, 256, (3, height, width), np.uint8), depth=depth, counted=counted)
-
-
 class OnProcessor:
     """One iteration of the package's own kernels, with what stands between them."""
 

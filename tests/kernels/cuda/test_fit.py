@@ -12,8 +12,8 @@ from splatctrl_cli.kernels.cuda.fit import LIST_CAPACITY, DeviceFit, bytes_neede
 from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import Float32, LossTerms, LossWeights, OptimiserSettings, TargetView
 from tests.kernels.cuda.emulator import EmulatedDevice
-from tests.kernels.cuda.scenes import SETTINGS, WEIGHTS, OnProcessor, camera, moments, parameters, target
-from tests.kernels.scenes import visible
+from tests.kernels.cuda.scenes import SETTINGS, WEIGHTS, OnProcessor, camera, parameters
+from tests.kernels.scenes import moments, target, visible
 from tests.reference import loss as loss_reference
 from tests.reference import raster as raster_reference
 from tests.refused import expect_refusal
@@ -75,14 +75,6 @@ def test_planes_equal_those_of_the_processor(scene: str, device: Memory) -> None
     assert [error(planes[k], want[k]) < FORWARD for k in range(5)] == [True] * 5
 
 
-def test_planes_equal_the_reference_in_float64(device: Memory) -> None:
-    p = distinct(60)
-    planes = fitted(device, p).planes(0)
-    t = torch.tensor(p.astype(np.float64))
-    want = raster_reference.render(torch.tensor(camera()), t[:, :3], t[:, 3].exp(), t[:, 7].sigmoid(), t[:, 4:7])
-    assert error(planes, want.numpy()) < FORWARD
-
-
 def test_lists_longer_than_shared_memory_are_blended_in_order(device: Memory) -> None:
     """2,500 splats over four tiles: sorted in the device's own memory; more of them than the lists first hold."""
     p = parameters(2500, radius=0.03, seed=2)
@@ -132,14 +124,16 @@ def test_gradients_equal_those_of_the_processor(scene: str, device: Memory) -> N
     assert np.array_equal(gradients.any(axis=1), want.any(axis=1))
 
 
-def test_gradients_equal_autograd_of_the_references(device: Memory) -> None:
+def test_planes_and_gradients_equal_the_references_and_their_autograd(device: Memory) -> None:
     p = distinct(60)
     seen, weights = target(), replace(WEIGHTS, normalised=False)
-    gradients, _ = derivatives(fitted(device, p), weights, replace(SETTINGS, regulariser=0.0))
+    fit = fitted(device, p)
+    gradients, _ = derivatives(fit, weights, replace(SETTINGS, regulariser=0.0))
     leaf = torch.tensor(p.astype(np.float64), requires_grad=True)
     planes = raster_reference.render(
         torch.tensor(camera()), leaf[:, :3], leaf[:, 3].exp(), leaf[:, 7].sigmoid(), leaf[:, 4:7]
     )
+    assert error(fit.planes(0), planes.detach().numpy()) < FORWARD
     value = loss_reference.loss(
         planes,
         torch.tensor(seen.color.astype(np.float64) / 255.0),
@@ -180,7 +174,8 @@ def test_iterations_equal_those_of_the_processor(device: Memory) -> None:
     assert (set(terms), values(terms[0])) == ({0, 1}, pytest.approx(values(want_terms), rel=1e-4))
 
 
-def run_bytes(device: Memory, p: Float32, **sizes: int) -> bytes:
+def run_bytes(device: Memory, **sizes: int) -> bytes:
+    p = SCENES["small"]
     fit = DeviceFit(device, len(p), **sizes)
     fit.put(p, moments(len(p)))
     for k in range(2):
@@ -197,18 +192,15 @@ def run_bytes(device: Memory, p: Float32, **sizes: int) -> bytes:
 
 
 def test_bytes_are_the_same_in_every_run(new_device: Callable[[], Memory]) -> None:
-    p = SCENES["small"]
-    assert run_bytes(new_device(), p) == run_bytes(new_device(), p)
+    assert run_bytes(new_device()) == run_bytes(new_device())
 
 
 def test_bytes_do_not_depend_on_the_order_of_threads_and_blocks() -> None:
-    p = SCENES["small"]
-    assert run_bytes(EmulatedDevice(), p) == run_bytes(EmulatedDevice(backwards=True), p)
+    assert run_bytes(EmulatedDevice()) == run_bytes(EmulatedDevice(backwards=True))
 
 
 def test_a_run_whose_lists_were_too_short_is_repeated(device: Memory) -> None:
-    p = SCENES["small"]
-    assert run_bytes(device, p, list_capacity=8, part_capacity=64) == run_bytes(device, p)
+    assert run_bytes(device, list_capacity=8, part_capacity=64) == run_bytes(device)
 
 
 def test_splats_out_of_view_keep_their_bytes(device: Memory) -> None:
