@@ -115,8 +115,7 @@ def test_a_point_counts_where_its_nearest_cell_was_observed(tmp_path: Path) -> N
         cell = tuple(round(float(x)) for x in (point - LOW) / RESOLUTION)
         expected.append(bool(all(0 <= c < n for c, n in zip(cell, mask.shape, strict=True)) and mask[cell]))
     assert 300 < sum(expected) < 3000 and space.observed(points / 1000).tolist() == expected
-    near = ((points >= LOW - 60) & (points < HIGH + 120)).all(axis=1)
-    assert space.near(points / 1000).tolist() == near.tolist()
+    assert space.near(points / 1000).tolist() == ((points >= LOW - 60) & (points < HIGH + 120)).all(axis=1).tolist()
     around = np.array([[0.0, 0.0, 0.679], [0.0, 0.0, 0.681], [-0.091, 0.0, 0.5]])
     assert space.near(around).tolist() == [True, False, False]
     assert space.above(np.array([[0.0, 0.0, 0.5301], [5.0, 5.0, 0.5299]])).tolist() == [True, False]

@@ -34,9 +34,8 @@ ONES = np.ones((H, W), np.float32)
 
 def photo() -> RgbdFrame:
     color = np.random.default_rng(0).integers(51, 153, (H, W, 3))
-    depth = np.broadcast_to((np.arange(H) >= 5)[:, None], (H, W))
     return plain_frame(
-        depth,
+        np.broadcast_to((np.arange(H) >= 5)[:, None], (H, W)),
         Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H),
         stamp_ns=7,
         camera="cam3",

@@ -110,9 +110,8 @@ def test_the_bound_certifies_splats_and_never_seen_cells(
 ) -> None:
     points = queries(1500, extent=0.4)
     hard, _ = SphereField(Spheres.of(*cloud())).query(points)
-    cubes = cube_distance(points, cell_centers(grid, is_unknown), grid.voxel)
     certified = GridField(solid).certified(points)
-    assert (certified <= np.minimum(hard, cubes)).all()
+    assert (certified <= np.minimum(hard, cube_distance(points, cell_centers(grid, is_unknown), grid.voxel))).all()
     assert (certified < GridField(grid).certified(points) - 1e-3).any()
     for name in CHANNELS:
         assert solid.channels[name].dtype == grid.channels[name].dtype and np.isfinite(solid.channels[name]).all()

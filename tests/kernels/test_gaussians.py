@@ -98,7 +98,6 @@ def test_degree_zero_does_not_look_at_higher_harmonics() -> None:
 
 
 def test_unseeable_gaussians_are_left_out() -> None:
-    view = pack_camera(100.0, 100.0, 20.0, 15.0, 41, 31, np.eye(4))
     fine = np.zeros(59, np.float32)
     fine[[2, 6]] = 1.0
     fine[LOG_SCALE] = np.log(0.02)
@@ -107,7 +106,7 @@ def test_unseeable_gaussians_are_left_out() -> None:
     for row, column in ((3, 0), (4, 3), (5, 6), (6, LOGIT)):
         parameters[row, column] = np.nan
     parameters[7, QUAT], parameters[8, LOGIT] = 0.0, -7.0
-    raster, planes = rendered(parameters, view)
+    raster, planes = rendered(parameters, pack_camera(100.0, 100.0, 20.0, 15.0, 41, 31, np.eye(4)))
     is_visible = np.empty(len(parameters), np.uint8)
     raster.native.visible(is_visible)
     assert is_visible.tolist() == [0] * 9 + [1]

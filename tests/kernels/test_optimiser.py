@@ -85,11 +85,10 @@ def test_splats_out_of_view_keep_parameters_and_moments() -> None:
 
 
 def test_noise_moves_transparent_splats_and_leaves_opaque_ones() -> None:
-    flat = np.zeros((5, 32, 48), np.float32)
     p = splats()
     p[:, 7] = np.where(np.arange(len(p)) < 15, -2.6, 2.0)  # opacity 0.07 and 0.88
     before = p.copy()
-    stepped(p, moments(len(p)), settings(noise=5e5), flat)
+    stepped(p, moments(len(p)), settings(noise=5e5), np.zeros((5, 32, 48), np.float32))
     moved = np.linalg.norm(p[:, :3] - before[:, :3], axis=1)
     assert (moved[:15] > 1e-5).all() and (moved[:15] <= 0.5 * np.sqrt(3) * np.exp(before[:15, 3]) + 1e-6).all()
     assert (moved[15:] < 1e-7).all()

@@ -86,17 +86,24 @@ def test_the_gap_is_that_of_the_reference_and_the_same_from_either_side(tmp_path
     assert 1 < sum(gap < 0 for gap in found) < 11
 
 
-def test_surfaces_that_cross_without_a_vertex_inside_overlap(tmp_path: Path) -> None:
-    rod, other = box(tmp_path, 0.02, 0.02, 0.4), box(tmp_path, 0.4, 0.03, 0.03)
-    assert surface_gap(rod, other, np.eye(4)) == -LEAST_OVERLAP
-    assert surface_gap(rod, other, pose_at((0, 0.03, 0))) == pytest.approx(0.005, abs=1e-12)
+ROD, BEAM, LARGE, SMALL = (0.02, 0.02, 0.4), (0.4, 0.03, 0.03), (0.4, 0.4, 0.4), (0.02, 0.02, 0.02)
 
 
-def test_a_link_inside_another_overlaps_it_by_its_depth(tmp_path: Path) -> None:
-    large, small = box(tmp_path, 0.4, 0.4, 0.4), box(tmp_path, 0.02, 0.02, 0.02)
-    for a, b in ((large, small), (small, large)):
-        assert surface_gap(a, b, np.eye(4)) == pytest.approx(-0.19, abs=1e-9)
-    assert surface_gap(large, small, pose_at((0.195, 0, 0))) == pytest.approx(-0.015, abs=1e-9)
+@pytest.mark.parametrize(
+    ("one", "other", "shift", "gap"),
+    [
+        pytest.param(ROD, BEAM, (0, 0, 0), -LEAST_OVERLAP, id="cross without a vertex inside"),
+        pytest.param(ROD, BEAM, (0, 0.03, 0), 0.005, id="pass each other"),
+        pytest.param(LARGE, SMALL, (0, 0, 0), -0.19, id="in the middle of another"),
+        pytest.param(SMALL, LARGE, (0, 0, 0), -0.19, id="around the middle of another"),
+        pytest.param(LARGE, SMALL, (0.195, 0, 0), -0.015, id="half inside"),
+    ],
+)
+def test_boxes_overlap_by_their_depth_in_each_other(
+    tmp_path: Path, one: ArrayLike, other: ArrayLike, shift: ArrayLike, gap: float
+) -> None:
+    a, b = (box(tmp_path, *np.asarray(size)) for size in (one, other))
+    assert surface_gap(a, b, pose_at(np.asarray(shift))) == pytest.approx(gap, abs=1e-12)
 
 
 def test_the_depth_in_a_solid_is_the_distance_to_its_surface(tmp_path: Path) -> None:

@@ -137,9 +137,8 @@ def test_the_distance_to_a_mesh_is_exact_and_negative_inside(tmp_path: Path) -> 
     assert len(model.surface.triangles) == len(l_shape().faces) and len(model.surface.kinds) == 1
     assert not len(gone.triangles) and len(gone.kinds) == 2 and model.surface.by_spheres == gone.by_spheres == ()
     points = np.random.default_rng(3).uniform(-0.1, 0.4, (400, 3)) + np.array([0, 0, 0.3])
-    arms = [trimesh.creation.box(bounds=b) for b in ([[0, 0, 0], [0.3, 0.1, 0.1]], [[0, 0, 0], [0.1, 0.3, 0.1]])]
     gaps = []
-    for arm in arms:
+    for arm in [trimesh.creation.box(bounds=b) for b in ([[0, 0, 0], [0.3, 0.1, 0.1]], [[0, 0, 0], [0.1, 0.3, 0.1]])]:
         there = points - [0, 0, 0.3]
         beyond = np.maximum(arm.bounds[0] - there, there - arm.bounds[1])
         gaps.append(np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0))

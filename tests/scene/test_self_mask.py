@@ -414,7 +414,6 @@ def test_a_board_before_a_link_is_not_its_residual_and_a_displaced_link_is() -> 
     assert not len(masked(board).residuals.get("arm", ()))
     half = np.where(np.arange(160) < 80, board, ball)
     assert len(masked(half).residuals["arm"]) > 100 and np.abs(masked(half).residuals["arm"]).max() < 1e-3
-    displaced = masked(np.where(SHOWN, ball - 0.07, FLOOR)).residuals["arm"]
-    assert np.median(displaced) == pytest.approx(-0.07, abs=1e-3)
+    assert np.median(masked(np.where(SHOWN, ball - 0.07, FLOOR)).residuals["arm"]) == pytest.approx(-0.07, abs=1e-3)
     corner = np.where((np.arange(160) < 66) & SHOWN, ball - 0.2, np.where(SHOWN, ball - 0.07, FLOOR))
     assert np.median(masked(corner).residuals["arm"]) == pytest.approx(-0.07, abs=1e-3)  # few pixels occlude little

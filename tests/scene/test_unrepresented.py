@@ -119,8 +119,7 @@ def test_gap_filling_looks_at_all_that_is_bare_and_half_of_it_in_turn() -> None:
     halves = [bare_voxels(grid, splats, BOX, CONFIG, half) for half in (0, 1)]
     assert sorted(np.concatenate(halves).tolist()) == sorted(everything.tolist())
     assert min(len(half) for half in halves) > 0.3 * len(everything) > 0
-    missing = reads_bare(grid, splats).centers
-    assert {tuple(c) for c in missing.tolist()} <= {tuple(c) for c in everything.tolist()}
+    assert {tuple(c) for c in reads_bare(grid, splats).centers.tolist()} <= {tuple(c) for c in everything.tolist()}
     above = Box(lower=np.array([0.0, 0.0, 0.2]), upper=BOX.upper)
     assert (bare_voxels(grid, splats, above, CONFIG)[:, 2] > 0.2).all()
 

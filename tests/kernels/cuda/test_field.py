@@ -228,8 +228,7 @@ def test_a_baker_on_a_device_bakes_the_processors_channels(distance: str, device
 def test_a_certified_bound_never_exceeds_the_exact_distance_of_the_processor(device: Memory) -> None:
     splats, config, rng = splat_set(*cloud(NUM)), FieldConfig(voxel=0.03), np.random.default_rng(4)
     layout = GridLayout.over(NEAR, config.voxel)
-    baker = Baker(splats, layout, config, channels=("sdf", "bound"), device=device)
-    planes = bake_planes(baker, 0, layout.shape[0])
+    planes = bake_planes(Baker(splats, layout, config, channels=("sdf", "bound"), device=device), 0, layout.shape[0])
     field = GridField(DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header={}))
     points = rng.uniform(layout.box.lower - 0.1, layout.box.upper + 0.1, (200_000, 3))
     gap = SphereField(Spheres.of(*cloud(NUM)), threads=2).query(points)[0] - field.certified(points)
