@@ -9,6 +9,7 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import cloud_score, points_on, space_out, thin
 from splatctrl_cli.formats.mesh import TriangleMesh
 from splatctrl_cli.records import Float64
+from tests.refused import expect_refusal
 
 
 def plane(z: float, size: float = 0.1, step: float = 0.005) -> Float64:
@@ -44,27 +45,52 @@ def test_what_is_farther_than_the_maximum_counts_in_a_share_only() -> None:
 
 
 def test_another_unit_or_frame_is_told_from_a_bad_surface() -> None:
-    with pytest.raises(NotEvaluableError, match=r"points within 20 mm of the scene's surface, got none; it spans"):
-        cloud_score(plane(0.0), 1000 * plane(1.0), SEEN)
-    with pytest.raises(UsageError, match="--cloud-max: expected a distance above 0 m, got 0"):
-        cloud_score(plane(0.0), plane(0.0), SEEN, max_distance=0.0)
+    expect_refusal(
+        r"points within 20 mm of the scene's surface, got none; it spans",
+        cloud_score,
+        plane(0.0),
+        1000 * plane(1.0),
+        SEEN,
+        error=NotEvaluableError,
+    )
+    expect_refusal(
+        "--cloud-max: expected a distance above 0 m, got 0",
+        cloud_score,
+        plane(0.0),
+        plane(0.0),
+        SEEN,
+        error=UsageError,
+        max_distance=0.0,
+    )
 
 
 @pytest.mark.parametrize("factor", [1000.0, 0.001, 100.0])
 def test_a_cloud_that_would_fit_in_another_unit_is_refused_with_that_unit(factor: float) -> None:
     surface = np.vstack([plane(0.0, 0.8, 0.05), plane(0.4, 0.8, 0.05)])
-    with pytest.raises(
-        NotEvaluableError, match=f"times as large it overlaps by 100%; .* --cloud-unit {0.02 * factor:g}$"
-    ):
-        cloud_score(surface, surface / factor, np.ones(len(surface), np.bool_), unit=0.02)
+    expect_refusal(
+        f"times as large it overlaps by 100%; .* --cloud-unit {0.02 * factor:g}$",
+        cloud_score,
+        surface,
+        surface / factor,
+        np.ones(len(surface), np.bool_),
+        error=NotEvaluableError,
+        unit=0.02,
+    )
 
 
 def test_points_that_do_not_count_enter_no_accuracy_but_complete_the_surface() -> None:
     points, counts = np.vstack([plane(0.003), plane(0.0)]), np.repeat([True, False], 400)
     score = cloud_score(points, plane(0.0), SEEN, counts=counts)
     assert (score["accuracy"], score["completeness"], score["num_points"]) == (pytest.approx(0.003), 0.0, 400)
-    with pytest.raises(NotEvaluableError, match="the scene's surface: expected points to compare, got none"):
-        cloud_score(points, plane(0.0), SEEN, counts=counts & False)
+    expect_refusal(
+        "the scene's surface: expected points to compare, got none",
+        cloud_score,
+        points,
+        plane(0.0),
+        SEEN,
+        error=NotEvaluableError,
+        counts=counts & False,
+    )
 
 
 def test_spaced_points_are_what_taking_them_in_turn_leaves() -> None:

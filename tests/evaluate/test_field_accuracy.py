@@ -94,8 +94,9 @@ def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
 
 @pytest.mark.parametrize("header", [{}, {"bound_margin": "wide"}])
 def test_a_grid_without_its_bounds_margin_is_refused(header: dict[str, object]) -> None:
-    with pytest.raises(InputError, match="expected a channel hard or bound, got sdf, bound"):
-        grid_distances(small_grid(header, sdf=0.0, bound=0.083))
+    expect_refusal(
+        "expected a channel hard or bound, got sdf, bound", grid_distances, small_grid(header, sdf=0.0, bound=0.083)
+    )
 
 
 HIDDEN, SEEN = -0.3, 0.3  # x of cells: a plate at 1 m hides the wall's left half
@@ -220,8 +221,9 @@ def test_a_mesh_elsewhere_or_a_grid_without_a_bound_is_refused(
     grid = box_grid()
     for part in (grid.channels, grid.header):
         part.pop(without, None)  # type: ignore[attr-defined]
-    with pytest.raises(error, match=words):
-        compare_with_mesh(grid, write_box(tmp_path / "box.stl", at=np.array([at, 0, 0])), seed=0)
+    expect_refusal(
+        words, compare_with_mesh, grid, write_box(tmp_path / "box.stl", at=np.array([at, 0, 0])), error=error, seed=0
+    )
 
 
 CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=99.5, cy=79.5, width=200, height=160)
@@ -313,10 +315,19 @@ def test_points_without_a_distance_and_over_estimates_count_wherever_they_are() 
 
 
 def test_frames_that_see_nothing_or_masks_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(NotEvaluableError, match="no pixel of 1 frames shows a point in the grid"):
-        held_out(height_grid(), [floor_frame((9.0, 0.0, 1.0), (9.0, 0.1, 0.0))])
-    with pytest.raises(InputError, match="expected a mask of the size of each of 3 frames, got 1 masks"):
-        held_out(height_grid(), counted=[np.ones((160, 200), dtype=bool)])
+    expect_refusal(
+        "no pixel of 1 frames shows a point in the grid",
+        held_out,
+        height_grid(),
+        [floor_frame((9.0, 0.0, 1.0), (9.0, 0.1, 0.0))],
+        error=NotEvaluableError,
+    )
+    expect_refusal(
+        "expected a mask of the size of each of 3 frames, got 1 masks",
+        held_out,
+        height_grid(),
+        counted=[np.ones((160, 200), dtype=bool)],
+    )
 
 
 def test_pixels_of_the_robot_and_outside_the_workspace_do_not_count() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.score import (
     CORRECTABLE,
     CORRECTED,
@@ -223,10 +223,13 @@ def test_a_mask_inside_out_is_told_by_the_border_of_the_image() -> None:
 
 
 def test_a_mask_without_a_pixel_is_refused_with_the_view() -> None:
-    with pytest.raises(
-        InputError, match=r"holdout-0003: mask rule 'object mask': expected pixels .* got none of 768"
-    ):
-        lines_of(Doubts(is_still=True, mask_rule="object mask"), (3,), disc() & False)
+    expect_refusal(
+        r"holdout-0003: mask rule 'object mask': expected pixels .* got none of 768",
+        lines_of,
+        Doubts(is_still=True, mask_rule="object mask"),
+        (3,),
+        disc() & False,
+    )
 
 
 def test_a_view_that_stands_where_one_trained_is_named_unless_that_is_meant() -> None:

@@ -118,5 +118,10 @@ def test_a_box_that_holds_no_splat_has_the_distances_to_those_beyond(weights: st
     assert (grid.channels["probability"] == 0).all()
     for values in grid.channels.values():
         assert np.isfinite(values).all()
-    with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw"):
-        apply_unknown(bake(splat_set(centers, radii), box, FieldConfig(voxel=0.1)), "obstacle")
+    expect_refusal(
+        "expected a cell that some camera saw",
+        apply_unknown,
+        bake(splat_set(centers, radii), box, FieldConfig(voxel=0.1)),
+        "obstacle",
+        error=NotEvaluableError,
+    )

@@ -109,9 +109,7 @@ def test_how_the_planes_are_cut_does_not_change_a_bit() -> None:
     layout = GridLayout.over(BOX, CONFIG.voxel)
     baker = Baker(splats, layout, CONFIG)
     for first, last in ((0, 8), (8, 24), (24, layout.shape[0])):
-        part = baker.allocate(last - first)
-        baker.bake(first, last, part)
-        for name, values in part.items():
+        for name, values in bake_planes(baker, first, last).items():
             np.testing.assert_array_equal(values, whole[name][first:last], err_msg=name)
 
 
@@ -156,17 +154,16 @@ def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
     occupancy = plain_grid(shape, 0.1, 0.0, log_odds=np.reshape([-2.0, 2.0, 0.0], shape))
     box = Box(lower=np.array([-0.1, 0.0, 0.0]), upper=np.array([0.3, 0.1, 0.1]))
     config = replace(CONFIG, voxel=0.1)
-    splats = splat_set(*cloud(10))
-    observed = bake(splats, box, config, occupancy=occupancy).channels["observed"]
-    np.testing.assert_array_equal(observed[:, 0, 0], [0, 1, 2, 3, 0])
-    assert not observed[:, 1].any()  # outside the occupancy grid
     unseen = replace(occupancy, num_updates=np.zeros(shape, np.uint16))
-    assert not bake(splats, box, config, occupancy=unseen).channels["observed"].any()
     swept = replace(unseen, entity=np.array([0, SWEPT, 0], np.uint8).reshape(shape))
-    np.testing.assert_array_equal(
-        bake(splats, box, config, occupancy=swept).channels["observed"][:, 0, 0], [0, 0, 4, 0, 0]
-    )
-    assert not bake(splats, box, config).channels["observed"].any()
+    for grid, expected in (
+        (occupancy, [0, 1, 2, 3, 0]),
+        (unseen, [0] * 5),
+        (swept, [0, 0, 4, 0, 0]),
+        (None, [0] * 5),
+    ):
+        observed = bake(splat_set(*cloud(10)), box, config, occupancy=grid).channels["observed"]
+        assert observed[:, 0, 0].tolist() == expected and observed.sum() == sum(expected)  # none outside of the grid
 
 
 def test_free_memory_is_what_the_machine_and_the_container_leave(
@@ -271,7 +268,15 @@ def test_statistics_count_what_the_grid_holds() -> None:
     channels = {"sdf": sdf, "gradient": gradient, "observed": observed, "hard": hard, "se": se}
     found = grid_statistics(DistanceGrid(origin=np.zeros(3), voxel=0.1, channels=channels, header={}))
     names = ("num_cells", "num_blank", "num_inside", "lowest", "highest", "never_seen_share", "hard_share")
-    assert [found[name] for name in names] == [12, 4, 1, pytest.approx(-0.1), 0.5, pytest.approx(2 / 3), pytest.approx(1 / 12)]
+    assert [found[name] for name in names] == [
+        12,
+        4,
+        1,
+        pytest.approx(-0.1),
+        0.5,
+        pytest.approx(2 / 3),
+        pytest.approx(1 / 12),
+    ]
     assert found["observed"] == {"never_seen": 8, "free": 4, "occupied": 0, "uncertain": 0, "swept_by_robot": 0}
     assert (found["excess"]["se"]["count"], found["excess"]["se"]["largest"]) == (1, pytest.approx(0.25))
     histogram = {index: count for index, count in enumerate(found["gradient"]["histogram"]) if count}
@@ -312,8 +317,22 @@ def test_unknown_space_in_slabs_is_that_of_the_whole_grid(policy: str, monkeypat
 
 def test_unknown_space_needs_somebody_who_looked_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     config = FieldConfig(unknown="obstacle")
-    with pytest.raises(NotEvaluableError, match="expected a cell that a camera saw, got none of 42840"):
-        UnknownSpace(LAYOUT, config, None, OccupancyConfig())
+    expect_refusal(
+        "expected a cell that a camera saw, got none of 42840",
+        UnknownSpace,
+        LAYOUT,
+        config,
+        None,
+        OccupancyConfig(),
+        error=NotEvaluableError,
+    )
     monkeypatch.setattr(layout_module, "available_memory", lambda: 10**6)
-    with pytest.raises(UsageError, match=r"obstacle: needs 0.0 GiB of memory, .* --unknown nan"):
-        UnknownSpace(LAYOUT, config, half_seen(), OccupancyConfig())
+    expect_refusal(
+        r"obstacle: needs 0.0 GiB of memory, .* --unknown nan",
+        UnknownSpace,
+        LAYOUT,
+        config,
+        half_seen(),
+        OccupancyConfig(),
+        error=UsageError,
+    )

@@ -14,6 +14,7 @@ from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, plane, queries, splat_set
 from tests.reference import field as reference
+from tests.refused import expect_refusal
 
 LENGTH, NOISE = FieldConfig.length_scale, FieldConfig.noise
 BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
@@ -92,5 +93,10 @@ def test_a_header_names_no_probability_without_the_channel_and_how_a_full_proces
 
 
 def test_the_probability_of_the_paper_has_no_full_process() -> None:
-    with pytest.raises(UsageError, match=r"expected field.weights = rowsum or voxel, got cg"):
-        PaperProbability(Spheres.of(*cloud(10)), FieldConfig(weights="cg"))
+    expect_refusal(
+        r"expected field.weights = rowsum or voxel, got cg",
+        PaperProbability,
+        Spheres.of(*cloud(10)),
+        FieldConfig(weights="cg"),
+        error=UsageError,
+    )

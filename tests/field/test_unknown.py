@@ -140,5 +140,10 @@ def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
         "no channel 'observed'", apply_unknown, replace(grid, channels={"sdf": grid.channels["sdf"]}), "nan"
     )
     never = {**grid.channels, "observed": np.zeros_like(grid.channels["observed"])}
-    with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw, got none of 9261"):
-        apply_unknown(replace(grid, channels=never), "obstacle")
+    expect_refusal(
+        "expected a cell that some camera saw, got none of 9261",
+        apply_unknown,
+        replace(grid, channels=never),
+        "obstacle",
+        error=NotEvaluableError,
+    )

@@ -21,6 +21,7 @@ from splatctrl_cli.field.weights import (
 from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
+from tests.refused import expect_refusal
 
 LENGTH, NOISE = 0.02, 1e-6
 MATERN, GAUSSIAN = (Kernel(length=LENGTH, is_matern=is_matern) for is_matern in (True, False))
@@ -142,21 +143,38 @@ def test_what_cannot_be_solved_is_refused_in_words(
     radii[0] = 0.3
     for name, value in change.items():
         monkeypatch.setattr(weights_module, name, value)
-    with pytest.raises((UsageError, NotEvaluableError), match=words):
-        kind(Spheres.of(centers, radii), FieldConfig(length_scale=length, weights=weights))
+    expect_refusal(
+        words,
+        kind,
+        Spheres.of(centers, radii),
+        FieldConfig(length_scale=length, weights=weights),
+        error=(UsageError, NotEvaluableError),
+    )
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
-    with pytest.raises(NotEvaluableError, match="not positive definite"):
-        conjugate_gradients(csr_array(np.array([[1.0, 3.0], [3.0, 1.0]])), np.array([1.0, -0.5]), 1e-9)
+    expect_refusal(
+        "not positive definite",
+        conjugate_gradients,
+        csr_array(np.array([[1.0, 3.0], [3.0, 1.0]])),
+        np.array([1.0, -0.5]),
+        1e-9,
+        error=NotEvaluableError,
+    )
 
 
 def test_the_refusal_names_the_residual_that_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     matrix, values, tolerance = csr_array(np.diag([1.0, 1.1, 1.3])), np.array([1.0, -0.5, 2.0]), 1e-9
     assert conjugate_gradients(matrix, values, tolerance)[2] <= 2e-9
     monkeypatch.setattr(weights_module, "CG_ITERATIONS", 1)
-    with pytest.raises(NotEvaluableError, match=r"expected a residual of at most 2\.0e-09 after 1 iterations"):
-        conjugate_gradients(matrix, values, tolerance)
+    expect_refusal(
+        r"expected a residual of at most 2\.0e-09 after 1 iterations",
+        conjugate_gradients,
+        matrix,
+        values,
+        tolerance,
+        error=NotEvaluableError,
+    )
 
 
 def test_coinciding_splats_share_their_weight() -> None:

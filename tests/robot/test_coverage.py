@@ -7,13 +7,13 @@ import pytest
 import trimesh
 
 from splatctrl_cli.config.fixed import DEFICIT_GAP
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.coverage import largest_deficit, uncovered_area
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
+from tests.refused import expect_refusal
 from tests.robot.shapes import BALL, BOX, arm_of, coverage_deficit, written
 
 CUBE = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).triangles
@@ -157,5 +157,9 @@ def test_spheres_of_a_rigid_body_cover_all_of_it_and_its_worst_link_counts_for_t
         model.replace_coverage(coverage_deficit(model.urdf, three)).sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9
     )
     assert np.isnan(model.sphere_deficit).all()
-    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
-        coverage_deficit(model.urdf, spheres(("wing", [0, 0, 0], 0.1)))
+    expect_refusal(
+        r"sphere set: link 'wing' is not in .*; links there: base, tip",
+        coverage_deficit,
+        model.urdf,
+        spheres(("wing", [0, 0, 0], 0.1)),
+    )

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf, visual_urdf
@@ -61,8 +60,12 @@ def test_a_robot_loads_with_a_set_of_spheres_or_none_at_all(tmp_path: Path) -> N
         path, SphereSet(links=("tip",), centers=np.array([[0, 0, 0.1]]), radii=np.array([0.1]))
     )
     np.testing.assert_allclose(model.sphere_centers(np.array([np.pi / 2])), [[0.1, 0, 0.3]], atol=1e-12)
-    with pytest.raises(InputError, match="sphere set: none of its links is in"):
-        RobotModel.from_urdf(path, SphereSet(links=("wing",), centers=np.zeros((1, 3)), radii=np.ones(1)))
+    expect_refusal(
+        "sphere set: none of its links is in",
+        RobotModel.from_urdf,
+        path,
+        SphereSet(links=("wing",), centers=np.zeros((1, 3)), radii=np.ones(1)),
+    )
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, carry_splats
 from splatctrl_cli.scene.removal import REASONS
 from splatctrl_cli.scene.render import render
+from tests.refused import expect_refusal
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
 CONFIG = SceneConfig(max_splats=1500, first_iterations=100, iterations_per_step=10)
@@ -126,8 +127,14 @@ def test_robot_splats_move_with_their_link() -> None:
 
 
 def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
-    with pytest.raises(UsageError, match=r"occupancy.voxel: expected at least scene.max_radius"):
-        SceneFitter(CONFIG, OccupancyConfig(voxel=0.01), WORKSPACE)
+    expect_refusal(
+        r"occupancy.voxel: expected at least scene.max_radius",
+        SceneFitter,
+        CONFIG,
+        OccupancyConfig(voxel=0.01),
+        WORKSPACE,
+        error=UsageError,
+    )
 
 
 def test_refining_a_scene_that_stands_still_improves_it_and_is_audited() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
@@ -29,15 +30,22 @@ def steps(*cameras: Sequence[RgbdFrame], has_clock: bool = True) -> tuple[list[T
     ), repeats
 
 
-def test_depth_that_equals_the_image_before_is_left_out_and_counted_though_its_colour_is_new() -> None:
-    found, repeats = steps(frames(1.0, 1.1, 1.1, 1.1, 1.0))
-    assert [step.stamp_ns // EVERY_NS for step in found] == [0, 1, 4]
-    assert repeats == {"cam0": 2}
-
-
-def test_one_camera_that_hangs_leaves_the_others_as_they_are() -> None:
-    found, repeats = steps(frames(1.0, 1.0, 1.0), frames(1.0, 1.1, 1.2, camera="cam1"))
-    assert [[each.camera for each in step.frames] for step in found] == [["cam0", "cam1"], ["cam1"], ["cam1"]]
+@pytest.mark.parametrize(
+    ("cameras", "expected"),
+    [
+        ([frames(1.0, 1.1, 1.1, 1.1, 1.0)], [(0, ["cam0"]), (1, ["cam0"]), (4, ["cam0"])]),
+        (
+            [frames(1.0, 1.0, 1.0), frames(1.0, 1.1, 1.2, camera="cam1")],
+            [(0, ["cam0", "cam1"]), (1, ["cam1"]), (2, ["cam1"])],
+        ),
+    ],
+    ids=["one camera", "beside a camera that goes on"],
+)
+def test_depth_that_equals_the_image_before_is_left_out_and_counted_though_its_colour_is_new(
+    cameras: list[list[RgbdFrame]], expected: list[tuple[int, list[str]]]
+) -> None:
+    found, repeats = steps(*cameras)
+    assert [(step.stamp_ns // EVERY_NS, [each.camera for each in step.frames]) for step in found] == expected
     assert repeats == {"cam0": 2}
 
 

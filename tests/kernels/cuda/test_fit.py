@@ -254,7 +254,6 @@ def test_lists_that_outgrow_the_memory_are_an_error_that_leaves_nothing_behind()
     free.close()
     assert not free.device.sizes
     fit = fitted(EmulatedDevice(limit=bytes_needed(len(p), [(20, 24)]) + 10_000), p, view, target(24, 20))
-    with pytest.raises(OutOfMemory, match=r"out of memory: 2500 splats .*3 MB are free"):
-        fit.planes(0)
+    expect_refusal(r"out of memory: 2500 splats .*3 MB are free", fit.planes, 0, error=OutOfMemory)
     fit.close()
     assert not fit.device.sizes
