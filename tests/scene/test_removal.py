@@ -90,23 +90,27 @@ def test_uncertainty_is_tolerated_for_a_while(counts_time: bool) -> None:
     assert slots.num_uncertain.any() == counts_time
 
 
-@pytest.mark.parametrize(("height", "floats"), [(0.0, False), (0.01, False), (0.03, True), (-0.1, False)])
-def test_a_splat_that_a_camera_sees_through_floats(height: float, floats: bool) -> None:
-    assert seen_through(np.float32([[0.1, 0.1, height]]), [view(frame())], 0.015).tolist() == [floats]
+BLOCK = frame(block=0.2)
+ROBOT = make_view(BLOCK, BLOCK.depth > 0, is_robot=BLOCK.depth < 0.9, reach=0.04)
+IN_THE_AIR = [[0.1, 0.1, 0.0], [0.1, 0.1, 0.01], [0.1, 0.1, 0.03], [0.1, 0.1, -0.1]]
+AT_THE_RIM = [[0.099, 0.0, 0.2], [0.105, 0.0, 0.2], [0.16, 0.0, 0.2]]
+AT_THE_ROBOT = [[0.105, 0.0, 0.2], [0.12, 0.0, 0.2], [0.12, 0.0, 0.0]]
 
 
-def test_a_silhouette_does_not_make_its_own_splats_float() -> None:
-    rim = np.float32([[0.099, 0.0, 0.2], [0.105, 0.0, 0.2], [0.16, 0.0, 0.2]])
-    assert seen_through(rim, [view(frame(block=0.2))], 0.015).tolist() == [False, False, True]
-
-
-def test_beside_the_robot_only_what_is_no_robot_keeps_a_splat_that_a_pixel_looks_past() -> None:
-    """The robot is the block; its own splats may stand three pixels beside its silhouette, an object's not."""
-    seen = frame(block=0.2)
-    beside = [make_view(seen, seen.depth > 0, is_robot=seen.depth < 0.9, reach=0.04)]
-    points = np.float32([[0.105, 0.0, 0.2], [0.12, 0.0, 0.2], [0.12, 0.0, 0.0]])
-    assert seen_through(points, beside, 0.015).tolist() == [False, True, False]
-    assert not seen_through(points, beside, 0.015, label=Label.ROBOT).any()
+@pytest.mark.parametrize(
+    ("points", "seen", "label", "floats"),
+    [
+        pytest.param(IN_THE_AIR, view(frame()), Label.OBJECT, [False, False, True, False], id="above a floor"),
+        pytest.param(AT_THE_RIM, view(BLOCK), Label.OBJECT, [False, False, True], id="beside a silhouette"),
+        pytest.param(AT_THE_ROBOT, ROBOT, Label.OBJECT, [False, True, False], id="beside the robot"),
+        pytest.param(AT_THE_ROBOT, ROBOT, Label.ROBOT, [False, False, False], id="of the robot"),
+    ],
+)
+def test_a_splat_that_a_camera_sees_through_floats(
+    points: list[list[float]], seen: View, label: Label, floats: list[bool]
+) -> None:
+    """The robot's own splats may stand three pixels beside its silhouette, an object's not."""
+    assert seen_through(np.float32(points), [seen], 0.015, label=label).tolist() == floats
 
 
 def test_what_no_camera_looks_at_does_not_float() -> None:
