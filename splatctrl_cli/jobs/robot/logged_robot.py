@@ -30,8 +30,8 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 class RobotOptions:
     """Options to read a robot's URDF.
 
-    spheres: None for the URDF's. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw. locked:
-    values [rad or m] of unlogged joints.
+    spheres: None for `default_spheres`. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw.
+    locked: values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
