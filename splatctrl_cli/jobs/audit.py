@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, lacking, read_verdict, verdict_of, worst
+from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, not_evaluable, read_verdict, verdict_of, worst
 from splatctrl_cli.files.output import (
     Stopwatch,
     recorded_as,
@@ -256,7 +256,7 @@ def _reconstruct(request: AuditRequest, progress: Progress) -> None:
 
 def _judge_map(request: AuditRequest) -> Verdict:
     checked, mapped = read_object(request.out / CHECK)["verdict"], open_run(request.out / SCENE).verdict
-    missing = lacking(
+    missing = not_evaluable(
         criterion="joint states",
         sentence=f"{request.log.name} has none, so no motion is judged, only the recording (check: "
         f"{checked['label']}) and its map (reconstruct: {mapped['label']}, {mapped['scope']})",

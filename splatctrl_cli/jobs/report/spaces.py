@@ -94,7 +94,7 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
     """Robot of a replay, by its command line or log. Raises InputError for missing files."""
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
-    places = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
+    places = {name: _file(run, file, roots) for name, file in files.items() if file is not None}
     if files["urdf"] is None and run.parts.has(run.path / ROBOT):
         places["urdf"] = run.parts.checked(run.path / ROBOT)
     refuse_if(

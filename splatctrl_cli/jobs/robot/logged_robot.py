@@ -84,14 +84,14 @@ def installed_urdf(name: str) -> Path:
     )
 
 
-def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
+def urdf_of(urdf: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
     """Robot of --urdf, else of the logs, with a warning if they differ.
 
     Raises InputError.
     """
-    if given is None:
+    if urdf is None:
         return logged_urdf(paths)
-    file = read_urdf(given)
+    file = read_urdf(urdf)
     if words := differs(file, paths):
         progress.log(f"warning: {words}; {TAKE}")
     return file

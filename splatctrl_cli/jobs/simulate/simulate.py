@@ -190,19 +190,19 @@ REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
 def copy_arm(
-    urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
+    urdf: Path, sphere_file: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    Spheres are `given`, or fitted. Raises InputError without collision geometry or meshes.
+    Spheres are `sphere_file`, or fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
     copy = folder / "robot.urdf"
     copy.write_text(_copy_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
-    if given is not None:
-        shutil.copyfile(given, spheres)
+    if sphere_file is not None:
+        shutil.copyfile(sphere_file, spheres)
     else:
         spheres.write_text(spheres_yaml(default_spheres(original, packages)), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
