@@ -10,7 +10,7 @@ import numpy as np
 
 from splatctrl_cli.calibration.evidence import (
     DEPTH,
-    HELD,
+    FIXED,
     OF_CAMERA,
     POSE,
     Estimate,
@@ -71,7 +71,7 @@ class Adjustment:
         """basis (P, K): directions of steps, None for all."""
         self.evidence = evidence
         self.unknowns = unknowns
-        self._clock = [unknowns.size - 1 if unknowns.has_clock else HELD]  # its column
+        self._clock = [unknowns.size - 1 if unknowns.has_clock else FIXED]  # its column
         self._basis = np.eye(unknowns.size) if basis is None else basis
 
     def solved(

@@ -24,7 +24,7 @@ from splatctrl_cli.robot.model import RobotModel
 
 POSE, DEPTH = 6, 2  # unknowns of a camera: a turn and a move in its own frame, the scale and bias of its depths
 OF_CAMERA = POSE + DEPTH
-HELD = -1
+FIXED = -1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +59,8 @@ class Unknowns:
         return POSE * len(self.poses) + len(self.scales) + len(self.biases) + self.has_clock
 
     def columns(self, camera: str) -> Index:
-        """The columns (8,) of a camera's unknowns, `HELD` if fixed."""
-        at = np.full(OF_CAMERA, HELD)
+        """The columns (8,) of a camera's unknowns, `FIXED` if fixed."""
+        at = np.full(OF_CAMERA, FIXED)
         if camera in self.poses:
             at[:POSE] = POSE * self.poses.index(camera) + np.arange(POSE)
         first = POSE * len(self.poses)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
-from splatctrl_cli.calibration.evidence import HELD, POSE, transform_of, twist_between
+from splatctrl_cli.calibration.evidence import FIXED, POSE, transform_of, twist_between
 from splatctrl_cli.calibration.gray_views import (
     GrayView,
     Rows,
@@ -93,7 +93,7 @@ def bends_alone() -> Float64:
 class BentViews:
     """Views, and the bends (C, G) of their cameras to solve for.
 
-    cameras (N,): number of each view's camera, or `HELD` where depth stays as recorded. now: the views with the
+    cameras (N,): number of each view's camera, or `FIXED` where depth stays as recorded. now: the views with the
     current bends removed.
     """
 
@@ -131,7 +131,7 @@ class BentViews:
         """(R, C G) derivatives of view i's residuals on view j by offsets."""
         size, parts = len(self._basis), []
         for k, pixels, by_stretch in ((i, self._pixels[i][rows.own], rows.by_own), (j, rows.other, rows.by_other)):
-            if self.cameras[k] == HELD:
+            if self.cameras[k] == FIXED:
                 parts.append(csr_array((len(pixels), self._num * size)))
                 continue
             weights = self._weights[self.recorded[k].gray.shape][pixels]
@@ -156,7 +156,7 @@ class BentViews:
     def _bend(self) -> None:
         grids, self._reach = self.grids, []
         for k, view in enumerate(self.recorded):
-            if self.cameras[k] == HELD:
+            if self.cameras[k] == FIXED:
                 self._reach.append(np.zeros(0))
                 continue
             offset = self._weights[view.gray.shape] @ grids[self.cameras[k]].ravel()
@@ -290,7 +290,8 @@ def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) ->
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     every = np.ones(len(views), np.bool_)
     bends = BentViews(
-        recorded=views, cameras=[cameras.index(frame.camera) if frame.camera in cameras else HELD for frame in frames]
+        recorded=views,
+        cameras=[cameras.index(frame.camera) if frame.camera in cameras else FIXED for frame in frames],
     )
     _solved(views, poses, overlapping(views, poses, every, every), every, bends)
     return dict(zip(cameras, np.round(bends.grids / scale, 7), strict=True))

@@ -278,7 +278,7 @@ def _thumbnails(watch: LogWatch, topics: CameraTopics, camera: Camera, posed: Se
 
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
-SAID = (" are never closer than ", " images as ", "distortion model ", " says rectified")  # other findings name them
+NAMED_ELSEWHERE = (" are never closer than ", " images as ", "distortion model ", " says rectified")
 
 
 def check_log(
@@ -376,7 +376,9 @@ def _findings(
     if any(finding.code == "pose-missing" for finding in findings):
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
     if log_survey.num_messages:
-        lacks = [lack for lack in missing(log, log_survey, options) if not any(words in lack for words in SAID)]
+        lacks = [
+            lack for lack in missing(log, log_survey, options) if not any(words in lack for words in NAMED_ELSEWHERE)
+        ]
     else:
         damage = "nothing usable before the damage" if log_survey.damage.count else "the log holds no messages"
         lacks = [f"{damage}; record it again, or give another file"]

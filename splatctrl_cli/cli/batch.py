@@ -71,9 +71,9 @@ class OfThisProgram:
         values_by_name = {"threads": self.threads, **options}
         known = [name for name in values_by_name if name not in OWN or f"--{name}" in parser._option_string_actions]
         for name, action in {name: find_action(parser, command, name) for name in known}.items():
-            made = words_of(name, action, values_by_name[name], folder)
-            places += made if not action.option_strings else []
-            words += made if action.option_strings else []
+            option_words = words_of(name, action, values_by_name[name], folder)
+            places += option_words if not action.option_strings else []
+            words += option_words if action.option_strings else []
         words += ["--json", *(["--", *places] if places else [])]
         parsed = parser.parse_args(words[1:])
         if hasattr(parsed, "set"):

@@ -138,8 +138,8 @@ def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse an unwritable output or report; a refused report is not written."""
     out, report = getattr(args, "out", None), getattr(args, "junit", None)
     values = [value for name, value in vars(args).items() if name not in ("out", "junit")]
-    given = [each for value in values for each in (value if isinstance(value, list) else [value])]
-    inputs = [each for each in given if isinstance(each, Path)]
+    arguments = [each for value in values for each in (value if isinstance(value, list) else [value])]
+    inputs = [each for each in arguments if isinstance(each, Path)]
     try:
         if report is not None:
             _check_output(report, inputs, "--junit")
@@ -160,11 +160,11 @@ def _check_outputs(args: argparse.Namespace) -> None:
 def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
     check_can_be_written(out)
     targets = _places(out)
-    for given in inputs:
-        source = Path(os.path.realpath(given))
+    for path in inputs:
+        source = Path(os.path.realpath(path))
         refuse_if(
             targets & {source, *source.parents},
-            f"{out}: would replace the input {given}",
+            f"{out}: would replace the input {path}",
             remedy=f"give another {option}",
             error=UsageError,
         )

@@ -68,12 +68,12 @@ class Parser(argparse.ArgumentParser):
     def _remedy(self, message: str, options: Sequence[str]) -> str:
         unknown = re.match(r"unrecognized arguments: (-[^\s=]*)", message)
         choice = re.match(r"argument (\S+): invalid choice: '([^']*)'", message)
-        lacking = re.match(r"argument (?:\S+/)?(--[^\s/]+): expected (?:one|at least one) argument", message)
+        without_value = re.match(r"argument (?:\S+/)?(--[^\s/]+): expected (?:one|at least one) argument", message)
         gone = GONE.get(choice[2] if choice else f"{self.prog} {unknown[1]}" if unknown else "")
         if gone is not None:
             return f"run {gone} instead"
-        if lacking:
-            return f"write {lacking[1]}=VALUE where the value begins with a minus, like {lacking[1]}=-1"
+        if without_value:
+            return f"write {without_value[1]}=VALUE where the value begins with a minus, like {without_value[1]}=-1"
         word, known = (unknown[1], options) if unknown else ("", ())
         if choice:
             action = next((a for a in self._actions if choice[1] in {a.metavar, a.dest, *a.option_strings}), None)

@@ -27,7 +27,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def run_view(args: argparse.Namespace, console: Console) -> int:
     result = view(request_of(ViewRequest, args))
-    pattern = "{}: {num_splats} splats, {num_states} states, {num_unknown} cubes never seen, {bytes} bytes"
+    pattern = "{}: {num_splats} splats, {num_states} states, {num_unknown} cubes of unseen space, {bytes} bytes"
     is_opened = not args.no_open and result.out is not None and open_page(result.out)
     console.result({**result.document, "is_opened": is_opened}, [pattern.format(result.out, **result.metrics)])
     if not is_opened and not args.no_open:

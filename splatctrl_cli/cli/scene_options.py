@@ -48,13 +48,14 @@ def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
 
 
 PLACED = (BASE, LOCK, PACKAGES)
+FITTED = "default: the URDF's own, else fitted to it once"
 RECONSTRUCT = (
     option("SOURCE", "log, capture folder, or an image folder's .toml", Path, nargs="?", fields={"recording": Path}),
     option("--dtu ROOT", "instead, a DTU data set in the layout of MVSNet, or of IDR and NeuS", Path),
     *output("scene folder", default="scene"),
     option("--resume", "continue an interrupted run; the result has the same bytes"),
     option("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path),
-    option("--spheres FILE.yaml", "its collision spheres", Path),
+    option("--spheres FILE.yaml", f"its collision spheres ({FITTED})", Path),
     *PLACED,
     SELF_MODEL,
     option(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)", fields=AS_BOX),
@@ -150,7 +151,7 @@ SDF_BAKE = (
             "human",
             fields=AS_LABELS,
         ),
-        option("--spheres FILE.yaml", "spheres of --urdf (default: the URDF's own)", Path),
+        option("--spheres FILE.yaml", f"spheres of --urdf ({FITTED})", Path),
         option(
             "--channels NAME,...",
             f"channels to bake besides sdf, of {', '.join(CHANNELS)} (default: {','.join(CHANNELS[:4])})",
@@ -329,7 +330,7 @@ REPLAY = (  # what people use, and in groups the rest
         required=True,
     ),
     option("--urdf FILE", "the robot's URDF (default: the log's own robot_description)", Path),
-    option("--spheres FILE.yaml", "its spheres (default: the URDF's own)", Path),
+    option("--spheres FILE.yaml", f"its spheres ({FITTED})", Path),
     option("--mode", "what to replay", MODES, "audit"),
     option(
         "--start-time S",
@@ -434,7 +435,7 @@ AUDIT = (
         option("--urdf FILE", "the robot's URDF (default: the log's own)", Path),
         option("--robot NAME", "or NAME.urdf of an installed Python package; an unknown name lists them"),
     ),
-    option("--spheres FILE.yaml", "its spheres (default: the URDF's own, else fitted into the output)", Path),
+    option("--spheres FILE.yaml", f"its spheres ({FITTED})", Path),
     *PLACED,
     either(
         option(f"--goal {POSE}", "also audit a closed loop to this pose, in world", pose),

@@ -60,7 +60,7 @@ class Reason:
 
 
 failed = partial(Reason, outcome=Outcome.FAILED)
-lacking = partial(Reason, outcome=Outcome.NOT_EVALUABLE)
+not_evaluable = partial(Reason, outcome=Outcome.NOT_EVALUABLE)
 """The evidence does not reach."""
 note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
 """Decides nothing and is worth a line."""
@@ -84,8 +84,8 @@ class Criterion(Generic[E]):
     broken: str
     meaning: str = ""
 
-    def reasons(self, found: E) -> Iterator[Reason]:
-        return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
+    def reasons(self, evidence: E) -> Iterator[Reason]:
+        return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(evidence))
 
     @property
     def docs(self) -> str:
@@ -179,7 +179,7 @@ def verdict_of(
 
     Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
     """
-    all_reasons = list(reasons) or [lacking(criterion="evidence", sentence="nothing was judged")]
+    all_reasons = list(reasons) or [not_evaluable(criterion="evidence", sentence="nothing was judged")]
     ordered = sorted(all_reasons, key=lambda reason: _WORST_FIRST.index(reason.outcome))
     outcome = ordered[0].outcome
     failure = next((r.label for r in ordered if r.outcome is Outcome.FAILED and r.label), "failed")

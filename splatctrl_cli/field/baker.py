@@ -22,7 +22,7 @@ from splatctrl_cli.voxels import OccupancyGrid
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 
 Planes = dict[str, NDArray[np.generic]]
-_Made = tuple[Planes, NDArray[np.int32] | None]
+_Baked = tuple[Planes, NDArray[np.int32] | None]
 T = TypeVar("T", bound=np.generic)
 
 
@@ -140,7 +140,7 @@ class Baker:
             channels["observed"] = _pick(observed, cells)
         return channels
 
-    def _bake_on_processor(self, span: GridSpan, cells: Index | None) -> _Made:
+    def _bake_on_processor(self, span: GridSpan, cells: Index | None) -> _Baked:
         hard, gradient, entry = self._hard(span, cells)
         kernels = {name: self._kernel(name, span, cells) for name in self.kernels}
         for name, (distance, _) in kernels.items():
@@ -156,7 +156,7 @@ class Baker:
             channels[name] = np.where(np.isnan(distance), hard, distance)
         return channels, entry
 
-    def _bake_on_device(self, span: GridSpan) -> _Made:
+    def _bake_on_device(self, span: GridSpan) -> _Baked:
         assert self.on_device is not None
         names = {*self.channels, "entry"} if "label" in self.channels else set(self.channels)
         answers = self.on_device.bake(span, names, margin=self.bound_margin)

@@ -177,7 +177,7 @@ def field_header(
 
 SLAB_BYTES = 48 << 20  # per slab's channels, or one block's planes if larger
 _CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen one
-_BESIDE = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB or a block's planes
+_CELL_BYTES = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB or a block's planes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +208,7 @@ def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
     planes = min(BLOCK, layout.shape[0])
     check_room(
         f"slab of {' x '.join(map(str, (planes, *layout.shape[1:])))} cells:",
-        planes * layout.shape[1] * layout.shape[2] * (bytes_per_cell(channels) + _BESIDE),
+        planes * layout.shape[1] * layout.shape[2] * (bytes_per_cell(channels) + _CELL_BYTES),
         "give a larger --voxel, fewer --channels, or a --box that is shorter along y and z",
     )
 
@@ -270,18 +270,18 @@ class UnknownSpace:
         }
 
 
-def bake_planes(baker: Baker, first: int, last: int, kept: EarlierBake | None = None) -> Planes:
-    """Channels of x-planes [first, last), before `UnknownSpace`; `kept` ones are copied."""
+def bake_planes(baker: Baker, first: int, last: int, earlier: EarlierBake | None = None) -> Planes:
+    """Channels of x-planes [first, last), before `UnknownSpace`; `earlier` ones are copied."""
     planes = baker.allocate(last - first)
-    if kept is None:
+    if earlier is None:
         baker.bake(first, last, planes)
         return planes
     for name, values in planes.items():
-        values[...] = kept.grid.channels[name][first:last]
-    if kept.mask[first // BLOCK : -(-last // BLOCK)].any():
-        baker.bake(first, last, planes, kept.mask)
+        values[...] = earlier.grid.channels[name][first:last]
+    if earlier.mask[first // BLOCK : -(-last // BLOCK)].any():
+        baker.bake(first, last, planes, earlier.mask)
     if "observed" in planes:
-        planes["observed"] = observed_planes(kept.occupancy, baker.layout, kept.thresholds, first, last)
+        planes["observed"] = observed_planes(earlier.occupancy, baker.layout, earlier.thresholds, first, last)
     return planes
 
 

@@ -10,9 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError, UsageError, WriteError, refuse_faults, refuse_if
-from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, lacking, read_verdict, verdict_of, worst
+from splatctrl_cli.evaluate.verdict import JudgedResult, Verdict, not_evaluable, read_verdict, verdict_of, worst
 from splatctrl_cli.files.output import (
     Stopwatch,
     recorded_as,
@@ -38,15 +37,13 @@ from splatctrl_cli.recording.log.stored_frame import FrameSource
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.report.page import Table, compared
-from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
-from splatctrl_cli.robot.sphere_files import own_spheres, spheres_yaml
-from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf, visual_urdf
 
 PAIR = "the last photo on the left, the map's render on the right; drag the photo's lower corner"
 WIDTH = 640  # of these [px]
 STEPS, RUN = "steps.json", "run.json"
-CHECK, SPHERES, PAGE = "check.json", "spheres.yaml", "report.html"
+CHECK, PAGE = "check.json", "report.html"
 SCENE, LOGGED, DRIVEN = "scene", "replay", "closed_loop"
 FINDING = ("severity", "code", "where", "what", "remedy")  # columns
 OF_REPLAYS = ("field", "control", "planner", "verdict")  # sections of the configuration that decide no map
@@ -57,10 +54,9 @@ TITLES = {LOGGED: "Logged motion", DRIVEN: "Driven motion", SCENE: "Map"}  # of 
 class AuditRequest(RobotOptions, RunOptions):
     """An audit of `log`, read by `options`, into the folder `out`.
 
-    urdf: the robot, or robot: its name, see `installed_urdf`; without both the log's own. spheres: None for the
-    URDF's, else fitted to it. goal (x, y, z, qx, qy, qz, qw in world) or goal_joints [rad] adds a closed loop that
-    drives the link `frame`. force: repeat all steps. resume: continue an interrupted reconstruction. words: options
-    that the steps share, for their ``run.json``.
+    urdf: the robot, or robot: its name, see `installed_urdf`; without both the log's own. goal (x, y, z, qx, qy, qz,
+    qw in world) or goal_joints [rad] adds a closed loop that drives the link `frame`. force: repeat all steps.
+    resume: continue an interrupted reconstruction. words: options that the steps share, for their ``run.json``.
     """
 
     log: Path
@@ -122,16 +118,12 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
         error=UsageError,
     )
     digests = {**source.digests(), **_digests(request, urdf)}
-    lacks_spheres = urdf is not None and request.spheres is None and not len(own_spheres(urdf).radii)
-    request = replace(request, spheres=request.out / SPHERES) if lacks_spheres else request
     replays = _replays(request) if source.joint_names else {}
     for each in replays.values():
         check_request(each)
     options = repr((request.options, request.base, request.locked))
     inputs = {"sha256": digests, "versions": deciding_versions(), "options": options}
     steps = _Steps(folder=request.out, inputs=inputs, done=_open_folder(request), progress=progress)
-    if urdf is not None and lacks_spheres:
-        steps.make("spheres", SPHERES, partial(_fit, urdf, request))
     steps.make("check", CHECK, partial(_check, request))
     config, seed = request.config.as_dict(), request.seed
     of_map = {name: config[name] for name in config if name not in OF_REPLAYS}
@@ -237,13 +229,6 @@ def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
     return read_object(file)
 
 
-def _fit(urdf: UrdfFile, request: AuditRequest) -> None:
-    solids = read_solids(urdf, request.packages)
-    fitted = fit_spheres(solids, FitOptions(max_spheres=max(DEFAULT_SPHERES, len(solids))))
-    text = spheres_yaml(fitted, [f"Collision spheres for {urdf.path.name}, fitted by: splatctrl audit."])
-    write_durably(request.out / SPHERES, lambda partial: partial.write_text(text, encoding="utf-8"))
-
-
 def _check(request: AuditRequest) -> None:
     report, verdict = check(CheckRequest(paths=(request.log,), options=request.options, **_robot(request)))
     document = {"verdict": verdict.as_dict(), **report.as_dict()}
@@ -271,7 +256,7 @@ def _reconstruct(request: AuditRequest, progress: Progress) -> None:
 
 def _judge_map(request: AuditRequest) -> Verdict:
     checked, mapped = read_object(request.out / CHECK)["verdict"], open_run(request.out / SCENE).verdict
-    missing = lacking(
+    missing = not_evaluable(
         criterion="joint states",
         sentence=f"{request.log.name} has none, so no motion is judged, only the recording (check: "
         f"{checked['label']}) and its map (reconstruct: {mapped['label']}, {mapped['scope']})",

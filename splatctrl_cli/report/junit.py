@@ -261,10 +261,10 @@ def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping
     for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:10]:
         file = _repository_path(suite.path, environment)
         properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
-        given = ",".join(
+        attributes = ",".join(
             f"{name}={_escape(value).replace(':', '%3A').replace(',', '%2C')}" for name, value in properties.items()
         )
-        lines.append(f"::{level} {given}::{_escape(case.text)}")
+        lines.append(f"::{level} {attributes}::{_escape(case.text)}")
     return lines
 
 

@@ -57,13 +57,13 @@ class Space:
     """Content of a 3-D page, world [m].
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
-    of never-seen cubes. surface: where a baked distance is 0. deciding: the event's sentence, time [s] and place,
-    with center and radius of the arm's sphere there [m]. cameras: name, place `eye` [m], unit vector `ahead` and
-    vertical angle `fov` [degrees] of each one.
+    of cubes without evidence, by its class. surface: where a baked distance is 0. deciding: the event's sentence,
+    time [s] and place, with center and radius of the arm's sphere there [m]. cameras: name, place `eye` [m], unit
+    vector `ahead` and vertical angle `fov` [degrees] of each one.
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
-    unknown: tuple[Float32, float] | None = None
+    unknown: Mapping[str, tuple[Float32, float]] = field(default_factory=dict)
     surface: Surface | None = None
     motion: Motion | None = None
     deciding: Mapping[str, Any] | None = None
@@ -159,9 +159,12 @@ def pack(space: Space) -> str:
             for time_s, splats in space.splats.items()
         ],
         "cameras": list(space.cameras),
+        "unknown": [
+            {"name": name, "points": _points(block, points), "edge": edge}
+            for name, (points, edge) in space.unknown.items()
+            if len(points)
+        ],
     }
-    if space.unknown is not None and len(space.unknown[0]):
-        header["unknown"] = {"points": _points(block, space.unknown[0]), "edge": space.unknown[1]}
     if space.surface is not None:
         header["surface"] = _mesh(block, space.surface)
     if space.motion is not None:

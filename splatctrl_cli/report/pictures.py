@@ -74,10 +74,10 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 
 
 @contextmanager
-def drawn_figure(path: Path, height: float, told: str = "") -> Iterator["mpl.figure.Figure"]:
+def drawn_figure(path: Path, height: float, description: str = "") -> Iterator["mpl.figure.Figure"]:
     """A figure of the house style, 1200 pixels wide, written undated when the block ends.
 
-    told: its description in the file.
+    description: its description in the file.
     """
     with mpl.rc_context(STYLE):
         layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
@@ -86,7 +86,7 @@ def drawn_figure(path: Path, height: float, told: str = "") -> Iterator["mpl.fig
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
             figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
-        metadata = {"Software": "splatctrl"} | ({"Description": told} if told else {})
+        metadata = {"Software": "splatctrl"} | ({"Description": description} if description else {})
         figure.savefig(path, dpi=DPI, facecolor="white", metadata=metadata)
 
 

@@ -24,8 +24,8 @@ from splatctrl_cli.robot.sphere_files import (
     lever_arms,
     match_links,
     read_spheres,
-    spheres_of,
 )
+from splatctrl_cli.robot.sphere_fit import default_spheres
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
@@ -108,7 +108,7 @@ class RobotModel:
         locked: Mapping[str, float] | None = None,
         packages: Sequence[Path] = (),
     ) -> "RobotModel":
-        """Build the robot of a URDF, with given spheres or the URDF's own.
+        """Build the robot of a URDF, with given spheres or `default_spheres`.
 
         T_world_base (4, 4): of the root link (default: world origin). locked: joints fixed at values [rad or m], with
         mimics. packages: folders for ``package://``, as in `read_solids`. Raises InputError.
@@ -119,7 +119,7 @@ class RobotModel:
         model = _without(model, file.add_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
-            spheres = spheres_of(file)
+            spheres = default_spheres(file, packages)
         unmatched = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = match_links(unmatched, file, "sphere set" if unmatched is spheres else str(spheres))
         return cls(

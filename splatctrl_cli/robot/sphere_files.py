@@ -216,8 +216,8 @@ def _join(path: Path, entries: list[dict[Any, Any]]) -> dict[Any, Any]:
 
 
 def _xrdf(path: Path, tree: dict[Any, Any]) -> dict[Any, Any]:
-    asked = tree.get("collision") or tree.get("world_collision")
-    collision, groups = (value if isinstance(value, dict) else {} for value in (asked, tree.get("geometry")))
+    section = tree.get("collision") or tree.get("world_collision")
+    collision, groups = (value if isinstance(value, dict) else {} for value in (section, tree.get("geometry")))
     name = collision.get("geometry", next(iter(groups), None) if len(groups) == 1 else None)
     group = groups.get(str(name))
     if not isinstance(group, dict) or "spheres" not in group:

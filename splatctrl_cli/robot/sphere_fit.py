@@ -10,17 +10,33 @@ and the best n spheres are a k-centre problem: minimise the largest over p of th
 cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink.
 """
 
+import hashlib
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
-from splatctrl_cli.errors import UsageError, refuse_if, require
+from splatctrl_cli import __version__
+from splatctrl_cli.config.fixed import (
+    DEFAULT_SPHERES,
+    DEFICIT_GAP,
+    FIT_BISECTIONS,
+    FIT_MIN_PATCH,
+    FIT_ROUNDS,
+    FIT_STEPS,
+    FIT_TIE,
+)
+from splatctrl_cli.errors import InputError, UsageError, refuse_if, require
+from splatctrl_cli.files.output import write_durably
 from splatctrl_cli.records import Bool, Float64, Index, SphereSet
 from splatctrl_cli.robot.coverage import areas, largest_deficit, refine_triangles
-from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
+from splatctrl_cli.robot.link_meshes import Solid, SolidDistance, mesh_path, read_solids
+from splatctrl_cli.robot.sphere_files import own_spheres, read_spheres, spheres_yaml
+from splatctrl_cli.robot.urdf import UrdfFile
 
 DIGITS = 6  # decimals of a written sphere: micrometres
 
@@ -41,6 +57,32 @@ class FitOptions:
     num_patches: int = 2000
     num_candidates: int = 2500
     seed: int = 0
+
+
+def default_spheres(urdf: UrdfFile, packages: Sequence[Path] = ()) -> SphereSet:
+    """Spheres of a URDF, else a fit of `DEFAULT_SPHERES`, stored in the user's cache.
+
+    packages: folders for ``package://``. Raises InputError without collision geometry.
+    """
+    own = own_spheres(urdf)
+    if len(own.radii):
+        return own
+    path = _cached_fit(urdf, packages)
+    with suppress(InputError):
+        return read_spheres(path)
+    solids = read_solids(urdf, packages)
+    fitted = fit_spheres(solids, FitOptions(max_spheres=max(DEFAULT_SPHERES, len(solids))))
+    text = spheres_yaml(fitted, [f"Fitted to {urdf.path.name} by splatctrl {__version__}."])
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+    return fitted
+
+
+def _cached_fit(urdf: UrdfFile, packages: Sequence[Path]) -> Path:
+    meshes = (mesh_path(urdf.path, mesh, packages).read_bytes() for mesh in urdf.meshes)
+    digest = hashlib.sha256(b"\0".join([__version__.encode(), urdf.text.encode(), *meshes])).hexdigest()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatctrl" / f"spheres-{digest}.yaml"
 
 
 def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:

@@ -40,7 +40,7 @@ from splatctrl_cli.scene.self_mask import (
 from splatctrl_cli.voxels import Unseen
 
 T = TypeVar("T", bound=np.generic)
-BESIDE = np.ones((3, 3), np.uint8)  # a block and its neighbours
+NEIGHBOURS = np.ones((3, 3), np.uint8)  # a block and its neighbours
 ALONG = np.array([[1.0, -2.0, 1.0]], np.float32)  # twice the deviation from the mean of two neighbours
 
 
@@ -124,7 +124,7 @@ def mask_frames(
     if robot is not None:
         seen = list(zip(frames, each(lambda frame: self_mask(frame, robot, config), frames), strict=True))
         others = [[*(other for other in seen if other is not one), *last] for one in seen]
-        masks = list(each(lambda one, asked: settle_pieces(one[0], one[1], asked, config), seen, others))
+        masks = list(each(lambda one, rest: settle_pieces(one[0], one[1], rest, config), seen, others))
         masks = outvote_objects(list(zip(frames, masks, strict=True)), occupancy.origin, config.voxel)
     is_drawn = robot is not None and robot.surface is not None and robot.surface.is_drawn
     rays = list(find_contradicted(list(zip(frames, masks, strict=True)), is_drawn=is_drawn, each=each))
@@ -213,7 +213,7 @@ class _BlockView:
     def of(cls, frame: RgbdFrame, mask: SelfMask) -> "_BlockView":
         side = max(1, frame.intrinsics.width // fixed.CONTRADICTING_COLUMNS)
         nearest, farthest = _least(frame.depth, side), -_least(-frame.depth, side)
-        surely = cv2.erode(nearest, BESIDE)  # 0 next to lost pixels
+        surely = cv2.erode(nearest, NEIGHBOURS)  # 0 next to lost pixels
         is_object = _least((mask.kinds == PixelKind.OBJECT).view(np.uint8), side) > 0
         v, u = np.nonzero((surely > 0) & _is_plane(nearest) & _is_plane(farthest) & is_object)
         middle, (rows, columns) = side // 2, surely.shape
@@ -223,7 +223,7 @@ class _BlockView:
         is_lost = (
             (frame.depth <= 0) & (mask.kinds != PixelKind.MIXED) & ~find_shadows(frame.depth, frame.intrinsics.fx)
         )
-        is_lost = cv2.erode(_least((is_lost & frame.is_in_view).view(np.uint8), side), BESIDE) > 0
+        is_lost = cv2.erode(_least((is_lost & frame.is_in_view).view(np.uint8), side), NEIGHBOURS) > 0
         return cls(
             frame=frame,
             side=side,
@@ -253,7 +253,7 @@ class _BlockView:
 
 
 def _side_by_side(depths: Float32, least: int) -> Float32:
-    wide = cv2.dilate(depths, BESIDE)
+    wide = cv2.dilate(depths, NEIGHBOURS)
     num, piece = cv2.connectedComponents((wide > 0).view(np.uint8), connectivity=8)
     counts = np.bincount(piece[depths > 0], minlength=num)
     return np.where((counts >= least)[piece], wide, np.float32(0.0))

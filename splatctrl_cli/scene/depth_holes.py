@@ -21,8 +21,8 @@ from splatctrl_cli.scene.seeding import Each
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_at, tolerance_at
 from splatctrl_cli.voxels import LostEdges, Unseen
 
-BESIDE = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
-BESIDE_ROBOT = np.ones((9, 9), np.uint8)  # its outline is fattened, too
+NEIGHBOURS = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
+ROBOT_OUTLINE = np.ones((9, 9), np.uint8)  # its outline is fattened, too
 MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
 
@@ -62,7 +62,7 @@ def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
         return np.zeros_like(is_blank)
     is_shadow = find_shadows(frame.depth, frame.intrinsics.fx)
     is_blank &= ~is_shadow
-    is_end = _add_shadow(cv2.dilate(is_robot.view(np.uint8), BESIDE_ROBOT) > 0, is_shadow) | ~frame.is_in_view
+    is_end = _add_shadow(cv2.dilate(is_robot.view(np.uint8), ROBOT_OUTLINE) > 0, is_shadow) | ~frame.is_in_view
     num, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
     is_closed = np.arange(num) > 0
     for some in (groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]):
@@ -75,7 +75,7 @@ def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
         return is_robot
     _, groups = cv2.connectedComponents(is_shadow.view(np.uint8), connectivity=8)
     is_beside = is_shadow & np.isin(groups, np.unique(groups[is_robot & is_shadow]))
-    return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), BESIDE) > 0))
+    return np.asarray(is_robot | (cv2.dilate(is_beside.view(np.uint8), NEIGHBOURS) > 0))
 
 
 def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:
@@ -113,7 +113,7 @@ def lost_edges(
     are left out.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
-    surely = [cv2.erode(frame.depth, BESIDE) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
+    surely = [cv2.erode(frame.depth, NEIGHBOURS) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
     by_camera = dict[str, LostEdges]()
     for (frame, _), some in zip(seen, each(lambda one: _edges_of(one[0], one[1], config), seen), strict=True):
         edges = some.select(~points.seen_through(some.centers, cameras, surely, config.see_through))
@@ -126,12 +126,12 @@ def lost_edges(
 def _edges_of(frame: RgbdFrame, mask: SelfMask, config: OccupancyConfig) -> LostEdges:
     is_object = mask.kinds == PixelKind.OBJECT
     is_object &= ~is_mixed(frame.depth, is_object, tolerance_at(frame.depth, config), 2, frame.intrinsics.fx)
-    is_object = cv2.morphologyEx(is_object.view(np.uint8), cv2.MORPH_OPEN, BESIDE) > 0
+    is_object = cv2.morphologyEx(is_object.view(np.uint8), cv2.MORPH_OPEN, NEIGHBOURS) > 0
     is_robot = (mask.kinds == PixelKind.ROBOT) | (mask.kinds == PixelKind.MIXED)
-    nearby = cv2.erode(np.where(is_object, frame.depth, np.float32(np.inf)), BESIDE)
+    nearby = cv2.erode(np.where(is_object, frame.depth, np.float32(np.inf)), NEIGHBOURS)
     is_beside, is_outline = (
         cv2.dilate(pixels.view(np.uint8), reach) > 0
-        for pixels, reach in ((is_object, BESIDE), (is_robot, NEAR_ROBOT))
+        for pixels, reach in ((is_object, NEIGHBOURS), (is_robot, NEAR_ROBOT))
     )
     is_lost = (frame.depth <= 0) & is_beside & ~is_outline & frame.is_in_view
     v, u = np.divmod(np.flatnonzero(is_lost), frame.intrinsics.width)

@@ -351,7 +351,8 @@ class SceneFitter:
     ) -> Filled:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
-        For missing slots, splats are evicted every EVICT_EVERY steps, and counted in `removed`.
+        Surfaces in space that was free come first. For missing slots, splats are evicted and counted in `removed`: at
+        once for those, else every EVICT_EVERY steps.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -372,11 +373,14 @@ class SceneFitter:
             seeds = seeds.select(self._is_grounded(seeds.centers, views, label))
             if label == Label.OBJECT and is_lasting is not None:
                 seeds = seeds.select(is_lasting(seeds.centers))
-            num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
-            if label == Label.OBJECT and num_missing > 0 and self.num_steps % fixed.EVICT_EVERY == 0:
+            is_due = self.num_steps % fixed.EVICT_EVERY == 0
+            num_urgent = len(seeds) if is_due else int(self.occupancy.was_free(seeds.centers).sum())
+            num_missing = num_urgent - int((~self.buffer.is_alive).sum())
+            if label == Label.OBJECT and num_missing > 0:
                 shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
                 removed["evicted"] += self.buffer.kill(is_evicted)
+            seeds = seeds.select(np.argsort(~self.occupancy.was_free(seeds.centers), kind="stable"))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
         return filled
 

@@ -154,9 +154,9 @@ def contact_seeds(
     Their radius is half of it: larger splats stand out of a plane. mappable: pixels (H, W) of each frame.
     """
     radius = config.contact_radius
-    beside = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
+    near_robot = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
     seeds = gap_seeds(
-        [(frame, pixels) for (frame, _), pixels in zip(seen, beside, strict=True)],
+        [(frame, pixels) for (frame, _), pixels in zip(seen, near_robot, strict=True)],
         np.zeros((0, 3), np.float32),
         radius,
         replace(objects, radii=np.full(len(objects), radius, np.float32)),

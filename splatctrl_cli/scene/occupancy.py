@@ -187,6 +187,11 @@ class OccupancyMap:
         cells, is_inside = voxels_at(points_world, self.origin, self.config.voxel, self.entity.shape)
         return np.where(is_inside, self.entity[tuple(cells.T)], np.uint8(0))
 
+    def was_free(self, points_world: Float32) -> Bool:
+        """True (N,) at points (N, 3) that were free before the last time step."""
+        cells, is_inside = voxels_at(points_world, self.origin, self.config.voxel, self.entity.shape)
+        return np.asarray(is_inside & self._was_free[tuple(cells.T)])
+
     def entity_around(self, points_world: Float32) -> UInt8:
         """ORed entity bits (N,) of the eight nearest voxels."""
         bits = np.zeros(len(points_world), np.uint8)

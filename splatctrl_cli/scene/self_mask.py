@@ -102,13 +102,13 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         is_explained |= np.isin(inside, surface.vague)
     nearest_at_edge = least_within(nearest, edge - reach)  # infinite away from the outline
     nearest = least_within(nearest_at_edge, wide - edge)
-    beside = np.isfinite(nearest) & has_depth
+    at_outline = np.isfinite(nearest) & has_depth
     is_core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     is_sure = depth < nearest_at_edge
     is_sure |= cv2.erode(is_core.view(np.uint8), _window(edge - reach)).view(bool)
     if surface.trees:
         is_near = depth < farthest_within(farthest, wide - reach) + fixed.CONTACT_THICKNESS
-        v, u = np.divmod(np.flatnonzero(beside & is_near & ~is_explained), depth.shape[1])
+        v, u = np.divmod(np.flatnonzero(at_outline & is_near & ~is_explained), depth.shape[1])
         rays = back_project_pixels(frame.intrinsics, u + part[1].start, v + part[0].start, depth[v, u])
         sure = tolerance_at(depth[v, u], config, fixed.MASK_SURE) + edge * depth[v, u] / np.float32(
             frame.intrinsics.fx
@@ -124,12 +124,12 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         is_sure[v, u] &= gap > sure
     kinds[is_explained] = PixelKind.ROBOT
     is_object = kinds == PixelKind.OBJECT
-    kinds[beside & is_mixed(depth, is_object, tolerance, edge // 2, frame.intrinsics.fx)] = PixelKind.MIXED
+    kinds[at_outline & is_mixed(depth, is_object, tolerance, edge // 2, frame.intrinsics.fx)] = PixelKind.MIXED
     area = np.where(is_sure, np.square(depth / frame.intrinsics.fx), 0.0).astype(np.float64)
     is_object, is_edge = kinds == PixelKind.OBJECT, np.isfinite(nearest_at_edge)
     steps = surface_steps(is_object, depth, is_edge, edge, tolerance, config.depth_error)
     steps[_fixed_outline(surface, is_robot, link)] = 0.0  # else a table would run on into the foot on it
-    _judge(kinds, depth, beside, area, steps)
+    _judge(kinds, depth, at_outline, area, steps)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= fixed.MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.evidence import HELD, Estimate, Unknowns, transform_of, twist_between, twist_of
+from splatctrl_cli.calibration.evidence import FIXED, Estimate, Unknowns, transform_of, twist_between, twist_of
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, still_frame, strided, surface_normals
 from splatctrl_cli.geometry import back_project, look_at
 from splatctrl_cli.records import Intrinsics, RgbdFrame
@@ -78,7 +78,7 @@ def test_a_strided_frame_shows_the_same_points() -> None:
 def test_a_step_moves_what_is_free_and_holds_the_rest() -> None:
     unknowns = Unknowns(cameras=("a", "b"), poses=("b",), scales=("b",), has_clock=True)
     assert unknowns.size == 8
-    assert (unknowns.columns("a") == HELD).all()
+    assert (unknowns.columns("a") == FIXED).all()
     step = np.array([0.01, -0.02, 0.03, 0.1, 0.2, 0.3, 0.05, 0.004])
     start = Estimate(corrections={"a": np.eye(4), "b": transform_of(np.array([0.5, 0, 0, 0, 0, 0.2]))})
     moved = unknowns.moved(start, step)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.evidence import HELD, transform_of
+from splatctrl_cli.calibration.evidence import FIXED, transform_of
 from splatctrl_cli.calibration.gray_views import gray_view, rows_of
 from splatctrl_cli.calibration.pose_refinement import (
     BentViews,
@@ -173,7 +173,7 @@ def test_each_camera_has_its_own_bend_and_an_exact_one_none(
 
 
 def test_a_bend_has_no_part_in_what_poses_take_up(views: list[RgbdFrame]) -> None:
-    bends = BentViews(recorded=[gray_view(view, 1.0) for view in views[:2]], cameras=[0, HELD])
+    bends = BentViews(recorded=[gray_view(view, 1.0) for view in views[:2]], cameras=[0, FIXED])
     bends.move(np.ones(bends_alone().shape[1]))
     v, u = np.indices(fixed.BEND_GRID)
     for part in (np.ones_like(u), u, v):

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
@@ -21,7 +20,6 @@ from splatctrl_cli.jobs.audit import AuditRequest, audit
 from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.robot import logged_robot
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import SphereSet
 from tests.jobs.bake.baked import Said
 from tests.recording.log.make_log import messages_of, write_raw
 from tests.refused import expect_refusal
@@ -201,22 +199,6 @@ def test_a_log_without_joints_has_its_map_and_check_alone(desk: Desk, tmp_path: 
     )
     assert result.document["made"] == ["check", "scene", "report"]
     assert result.verdict.sentence in result.document["page"].read_text()
-
-
-def test_spheres_are_fitted_once_where_the_urdf_has_none(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = list[int]()
-
-    def fit(solids: dict[str, object], options: Any) -> SphereSet:
-        asked.append(options.max_spheres)
-        links, centers, radii = zip(*[(link, (0.0, 0.0, 0.0), 0.1) for link in solids], strict=True)
-        return SphereSet(links=links, centers=np.array(centers), radii=np.array(radii))
-
-    monkeypatch.setattr(module, "fit_spheres", fit)
-    assert desk.steps_made(spheres=None) == ("spheres", *ALL)
-    assert desk.steps_made(spheres=None) == ()
-    assert asked == [64]
-    words = json.loads((desk.request.out / "replay" / "run.json").read_text())["arguments"]
-    assert words[words.index("--spheres") + 1] == str(desk.request.out / "spheres.yaml")
 
 
 def test_a_log_that_names_no_robot_is_refused_at_once(desk: Desk) -> None:

@@ -10,7 +10,6 @@ import pytest
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.arm import arm_urdf
 from tests.refused import expect_refusal
 from tests.robot.shapes import written
 
@@ -102,7 +101,7 @@ def test_continuous_and_prismatic_joints_take_one_number_each_and_a_locked_one_n
         (PRISMATIC.replace('radius="0.2"', 'radius="-1"'), "link 'b': sphere: expected sizes above 0"),
         (PRISMATIC.replace('radius="0.2"', 'radius="wide"'), "link 'b': sphere: expected 1 number, got 'wide'"),
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>', "broken XML"),
-        (arm_urdf(), "expected collision geometry of spheres only, got 18 other shapes; give a spheres YAML"),
+        (PRISMATIC.replace("collision>", "visual>"), "expected collision geometry, got none"),
     ],
 )
 def test_unusable_urdfs_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:

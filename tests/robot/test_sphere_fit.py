@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.robot import sphere_fit
 from splatctrl_cli.robot.coverage import coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid, read_solids
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
-from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.sphere_fit import FitOptions, default_spheres, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 from tests.refused import expect_refusal
 from tests.robot.shapes import BOX, ROD, arm_of, l_shape, written
@@ -129,3 +132,35 @@ def test_thin_and_open_shapes_are_covered_too(tmp_path: Path) -> None:
 )
 def test_options_that_make_no_sense_are_refused(solids: Solids, options: FitOptions, message: str) -> None:
     expect_refusal(message, fit_spheres, solids, options, error=UsageError)
+
+
+def test_a_urdf_without_spheres_is_fitted_once_and_again_if_it_or_a_mesh_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits = list[int | None]()
+
+    def fit(solids: Solids, options: FitOptions) -> SphereSet:
+        fits.append(options.max_spheres)
+        return fit_spheres(solids, rough(max_spheres=3))
+
+    monkeypatch.setattr(sphere_fit, "fit_spheres", fit)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    l_shape().export(tmp_path / "ell.stl")
+    path = written(tmp_path, arm_of('<mesh filename="ell.stl"/>', ROD))
+    first, again = (RobotModel.from_urdf(path).sphere_set for _ in range(2))
+    assert fits == [DEFAULT_SPHERES] and first.links == again.links
+    np.testing.assert_array_equal(first.centers, again.centers)
+    (stored,) = (tmp_path / "cache" / "splatctrl").iterdir()
+    stored.write_text("broken: [")
+    RobotModel.from_urdf(path)
+    l_shape().apply_scale(1.1).export(tmp_path / "ell.stl")
+    RobotModel.from_urdf(path)
+    written(tmp_path, path.read_text().replace("0 0 0.3", "0 0 0.4"))
+    RobotModel.from_urdf(path)
+    assert len(fits) == 4
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    np.testing.assert_array_equal(RobotModel.from_urdf(path).sphere_set.radii, default_spheres(read_urdf(path)).radii)
+    own = arm_of('<sphere radius="0.1"/>', '<sphere radius="0.2"/>')
+    assert default_spheres(read_urdf(written(tmp_path, own))).radii.tolist() == [0.1, 0.2]
+    assert len(fits) == 6

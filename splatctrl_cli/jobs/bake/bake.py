@@ -71,11 +71,11 @@ CHECKPOINT = f"{FOLDER}/progress.json"
 
 
 def bake_to_disk(
-    job: "_Job", kept: EarlierBake | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
+    job: "_Job", earlier: EarlierBake | None, unknown: UnknownSpace | None, partial: Path, progress: Progress
 ) -> GridSlabs:
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
-    kept: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
+    earlier: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
     slab. Raises UsageError for other settings than that bake's, or too little room on disk or in memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
@@ -109,7 +109,7 @@ def bake_to_disk(
         total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=True if progress.is_quiet else None
     ) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
-            planes = bake_planes(baker, first, last, kept)
+            planes = bake_planes(baker, first, last, earlier)
             counts = baker.counts
             if unknown is not None:
                 planes = unknown.apply(planes, first, last, baker.bound_margin)
@@ -279,7 +279,7 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
 
 def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
     baker, previous, source, config = job.baker, job.previous, job.source, job.request.config
-    changes = kept = old = None
+    changes = earlier = old = None
     if previous is not None:
         before = obstacle_spheres(previous.source.splats, previous.source.unrepresented, job.request.labels).splats
         old = Baker(
@@ -293,15 +293,15 @@ def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGr
         if changes.reason:
             progress.log(f"--update: every block is baked anew: {changes.reason}")
         if changes.mask is not None:
-            kept = EarlierBake(
+            earlier = EarlierBake(
                 grid=previous.grid, mask=changes.mask, occupancy=source.occupancy, thresholds=config.occupancy
             )
     is_free = config.field.unknown == "free"
     unknown = None if is_free else UnknownSpace(baker.layout, config.field, source.occupancy, config.occupancy)
-    store = bake_to_disk(job, kept, unknown, partial, progress)
-    if kept is not None and old is not None and previous is not None:
+    store = bake_to_disk(job, earlier, unknown, partial, progress)
+    if earlier is not None and old is not None and previous is not None:
         counts: Any = previous.grid.header["kernel_counts"]
-        baker.counts = counts_after(counts, old, baker, kept.mask, list(slabs(baker.layout, baker.channels)))
+        baker.counts = counts_after(counts, old, baker, earlier.mask, list(slabs(baker.layout, baker.channels)))
     header = field_header(
         source.splats,
         job.obstacles.splats,
@@ -311,8 +311,8 @@ def _bake_grid(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGr
         num_unrepresented=job.obstacles.num_unrepresented,
     )
     header |= {} if unknown is None else unknown.header()
-    made = {"digests": source.digests, "stamp_ns": source.stamp_ns, "made_from": source.made_from}
-    return store.grid({**header, **made}), changes
+    provenance = {"digests": source.digests, "stamp_ns": source.stamp_ns, "made_from": source.made_from}
+    return store.grid({**header, **provenance}), changes
 
 
 def _draw(

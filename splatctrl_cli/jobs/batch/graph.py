@@ -167,10 +167,10 @@ def _nodes_of(
     out: Path,
     command_line: CommandLine,
 ) -> list[Node]:
-    made: dict[str, list[Node]] = {}
+    nodes_by_job: dict[str, list[Node]] = {}
     for job, needs in jobs:
-        made[job.name] = []
-        for before in itertools.product(*(made[name] for name in needs)):
+        nodes_by_job[job.name] = []
+        for before in itertools.product(*(nodes_by_job[name] for name in needs)):
             inherited = _join([node.variant for node in before])
             if inherited is None:
                 continue
@@ -194,7 +194,7 @@ def _nodes_of(
                     raise UsageError(f"{_where(job, recording)}: {error.message}", remedy=error.remedy) from None
                 outs = [each.out for each in before if each.out is not None]
                 inputs = (path for path in read if not any(out in (path, *path.parents) for out in outs))
-                made[job.name].append(
+                nodes_by_job[job.name].append(
                     Node(
                         name=f"{recording.name}/{place}",
                         recording=recording.name,
@@ -206,7 +206,7 @@ def _nodes_of(
                         out=its,
                     )
                 )
-    nodes = [node for each in made.values() for node in each]
+    nodes = [node for each in nodes_by_job.values() for node in each]
     by_name: dict[str, Node] = {}
     for node in nodes:
         refuse_if(

@@ -119,8 +119,8 @@ class Scheduler:
     def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
         """The earlier or skipped run that stands for a node; None if it must run."""
         key, folder = self.keys[node.name], self.ledger.folder
-        if lacking := [need for need in node.needs if not self.runs[need].stamp]:
-            run = not_run(node, key, folder, state=SKIPPED, cause=f"needs {lacking[0]}, which left nothing")
+        if missing := [need for need in node.needs if not self.runs[need].stamp]:
+            run = not_run(node, key, folder, state=SKIPPED, cause=f"needs {missing[0]}, which left nothing")
             is_known = before is not None and (before.state, before.key) == (SKIPPED, key)
             return run if is_known else self.ledger.record(run)
         if self.again:

@@ -9,7 +9,7 @@ from typing import Any
 
 from splatctrl_cli.errors import UsageError, refuse_if
 from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
-from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, failed, lacking, note, verdict_of
+from splatctrl_cli.evaluate.verdict import JudgedResult, Reason, failed, not_evaluable, note, verdict_of
 from splatctrl_cli.jobs.compare.judged_runs import (
     JudgedRun,
     JudgedRuns,
@@ -205,7 +205,7 @@ def _compare(before: JudgedRuns, after: JudgedRuns) -> CompareResult:
     reasons = [
         note(criterion="comparison", sentence=counted)
         if num_figures or num_verdicts
-        else lacking(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
+        else not_evaluable(criterion="comparison", sentence="no run has a verdict or a figure on both sides"),
         *_verdict_reasons(verdicts, after),
         *_regressions(alone, jobs, after.kind),
         *(

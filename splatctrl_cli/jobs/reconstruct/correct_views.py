@@ -107,7 +107,9 @@ def _correct_poses(
             "moved_median": float(np.median(refined.moved)),
             "moved_max": float(refined.moved.max()),
             "turned_max": float(refined.turned.max()),
-            "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, refined.is_held, strict=True) if held],
+            "held": [
+                f"{f.camera} at {f.stamp_ns}" for f, is_held in zip(frames, refined.is_held, strict=True) if is_held
+            ],
         },
     } | ({} if has_robot else _describe(bends, scale, apart, refined.after, console))
 

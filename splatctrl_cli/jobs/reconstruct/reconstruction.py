@@ -35,7 +35,7 @@ from splatctrl_cli.scene.scale import RecordedDepth, describe_scale, fitted_to
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import AuditRow, TimeStep, cloud_box, depth_box, time_steps
 
-KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
+STORED = ("num_read", "is_refined", "first_frames", "corrected")  # attributes a checkpoint stores unchanged
 
 
 def training_cameras(source: RecordSource) -> list[str]:
@@ -329,7 +329,7 @@ class Reconstruction:
     def _save(self, *, is_last: bool = False) -> None:
         progress = {
             "run": self.identity,
-            **{name: getattr(self, name) for name in KEPT},
+            **{name: getattr(self, name) for name in STORED},
             "disagreement": self.agreement.disagreement,
             "depth": None if self.depth is None else asdict(self.depth),
             "devices": self.device.history,
@@ -344,7 +344,7 @@ class Reconstruction:
             for row in self.writer.audited()
         ]
         progress = checkpoint.progress
-        for name in (*KEPT, "stamps"):
+        for name in (*STORED, "stamps"):
             setattr(self, name, progress[name])
         self.agreement.disagreement = progress["disagreement"]
         self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig, fixed
-from splatctrl_cli.evaluate.verdict import Reason, lacking
+from splatctrl_cli.evaluate.verdict import Reason, not_evaluable
 from splatctrl_cli.formats.scene.scene_folder import SceneFolder
 from splatctrl_cli.geometry import compare_poses
 from splatctrl_cli.recording.log.state_columns import StateColumns
@@ -113,13 +113,13 @@ def scene_mismatches(
 ) -> Iterator[Reason]:
     """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
     if scene.parts.digests is None:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{scene.path}: expected digests of its files, got none: an earlier version wrote it",
             remedy="reconstruct again",
         )
     yield from made_from_mismatches(scene.path, scene.made_from, source, model)
     if scene.has_clock and not scene.snapshots:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{scene.path}: expected snapshots over time, got only the map of its end",
             remedy="reconstruct again",
         )
@@ -139,29 +139,29 @@ def made_from_mismatches(
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
-    made, current = _calibrations(files), _calibrations(digests)
-    if made.keys() != current.keys():
+    earlier, current = _calibrations(files), _calibrations(digests)
+    if earlier.keys() != current.keys():
         with_made, with_given = (
-            f"with {', '.join(names.values())}" if names else "without one" for names in (made, current)
+            f"with {', '.join(names.values())}" if names else "without one" for names in (earlier, current)
         )
-        yield lacking(
+        yield not_evaluable(
             sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
             remedy="give the --calibration that it was made with, or reconstruct",
         )
     elif not other and recorded and source.cameras:
         other = differences(recorded, source.records())
     if other:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
         )
     if made_from.get("depth_bend"):
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{path} rests on depth corrected by up to {100 * made_from['depth_bend']:.1f} %, which no"
             " sensor measured",
             remedy="reconstruct with --urdf or without --refine-poses: depth stays as recorded",
         )
     if robot := _robot_difference(made_from, model):
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{path} was segmented with another robot, {robot}",
             remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
@@ -202,7 +202,7 @@ def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
     if apart_ns <= fixed.RECORDINGS_APART_NS:
         return None
     ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
-    return lacking(
+    return not_evaluable(
         sentence=f"joint states {ours} and a scene {theirs} are "
         + ("on clocks that do not overlap" if (apart_ns > fixed.CLOCK_MIXED * 1e9) else "of different times"),
         remedy="record both by one clock, or reconstruct this log",
@@ -221,7 +221,7 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
         _read_section(OccupancyConfig, used.get("occupancy")),
     )
     if not agreement.holds and agreement.num_voxels:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{scene.path}: splats and occupancy disagree: {100 * agreement.on_surface:.0f} % of the splats "
             f"lie on occupied voxels, {100 * agreement.represented:.0f} % of {agreement.num_voxels} occupied "
             "voxels are represented",
@@ -231,8 +231,8 @@ def _map_mismatches(scene: SceneFolder) -> Iterator[Reason]:
 
 def _read_section(section: type[S], values: object) -> S:
     known = {field.name for field in fields(section)}
-    given = values if isinstance(values, dict) else {}
-    return section(**{name: value for name, value in given.items() if name in known})
+    table = values if isinstance(values, dict) else {}
+    return section(**{name: value for name, value in table.items() if name in known})
 
 
 def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Reason | None:
@@ -240,7 +240,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Rea
     stamps = states.stamp_ns
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):
-        return lacking(
+        return not_evaluable(
             sentence=f"{truth.path} is of another recording: the log has none of its {len(truth.stamps)} stamps",
             remedy="give the truth.json that simulate wrote with the log",
         )
@@ -257,7 +257,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Rea
         worst = max(worst, abs(float(gap.min()) - float(recorded)))
     if worst <= fixed.SAME_CLEARANCE:
         return None
-    return lacking(
+    return not_evaluable(
         sentence=f"{truth.path} is of another recording: its clearances differ by up to {1e3 * worst:.0f} mm from "
         "those of the logged motion",
         remedy="give the truth.json that simulate wrote with the log",

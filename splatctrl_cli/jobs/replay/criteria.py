@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.columns import Event, EventKind, names_at
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, passed_reason, plural
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, not_evaluable, passed_reason, plural
 from splatctrl_cli.jobs.replay.inputs import LoggedStates
 from splatctrl_cli.jobs.replay.metrics import Metrics
 from splatctrl_cli.jobs.replay.request import Replay, ReplayInputs, ReplayRequest, Trace
@@ -62,7 +62,7 @@ def worst_state(
         return None
     at = int(pick(values))
     name = who[at] if who else ""
-    return lacking(sentence="", value=float(values[at]), time_s=trace.seconds(at), who=name, count=count)
+    return not_evaluable(sentence="", value=float(values[at]), time_s=trace.seconds(at), who=name, count=count)
 
 
 def largest_about(trace: Trace, column: str) -> float | None:

@@ -19,7 +19,7 @@ from splatctrl_cli.config.fixed import (
 )
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, lacking, passed_reason
+from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, not_evaluable, passed_reason
 from splatctrl_cli.jobs.reconstruct.verdict import displaced_camera
 from splatctrl_cli.jobs.replay.criteria import MARGIN, UNKNOWN, Bound, Judged, mm
 from splatctrl_cli.jobs.replay.request import OCCUPIED
@@ -127,14 +127,14 @@ def known_space(judged: Judged) -> Iterator[Reason]:
         yield from limit(judged)
     if (is_occupied := judged.request.unseen == OCCUPIED) or judged.request.require_proof:
         if np.isnan(judged.replay.trace["assumed"]).all():
-            yield lacking(
+            yield not_evaluable(
                 sentence="expected evidence of the space near the arm, got none",
                 remedy="give a reconstruction as --scene",
             )
         proof = replace(PROOF, outcome=Outcome.FAILED, label=MARGIN) if is_occupied else PROOF
         yield from proof(judged)
     if judged.metrics["unknown_share"] is None:
-        yield lacking(
+        yield not_evaluable(
             sentence="expected a record of the space that cameras saw, got none",
             remedy="give a reconstruction as --scene, or bake with the channel observed",
         )
@@ -145,7 +145,7 @@ def _unknown_share(judged: Judged) -> Reason:
     """The mean share, at the first state above the allowed one."""
     trace, share = judged.replay.trace, judged.metrics["unknown_share"]
     first_s = trace.seconds(int(np.argmax(trace["unknown_share"] > judged.request.max_unknown)))
-    return lacking(sentence="", value=share, time_s=first_s, count=judged.replay.num_states)
+    return not_evaluable(sentence="", value=share, time_s=first_s, count=judged.replay.num_states)
 
 
 UNKNOWN_SHARE = Bound(
@@ -165,9 +165,9 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     """
     measured, surface = judged.replay.map_error, lowest(judged.replay.trace["clearance_surface"])
     if measured is None and judged.request.require_evidence:
-        yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
+        yield not_evaluable(sentence="not measured", remedy="give --evidence a camera that did not train the map")
     if measured is not None and measured.bound is None:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"not bounded: {measured.num_seen} of {measured.num_sets} held-out frame sets show surface near "
             "the motion, too few for two independent stretches",
             who=measured.source,
@@ -180,7 +180,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     if surface >= value:
         yield passed_reason(bound_words(measured.bound), surface - value, 0.0, "m", measured.num_points)
         return
-    yield lacking(
+    yield not_evaluable(
         sentence=f"{bound_words(measured.bound)}, but the clearance is only {mm(surface)}; largest miss",
         value=surface - value,
         threshold=0.0,
@@ -216,7 +216,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     """Each camera sees the robot, and all cameras each link, within 5 mm of joints."""
     figures = judged.inputs.scene.figures()
     if (camera := find_displaced(judged)) is not None:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{camera[0]} sees the robot {mm(camera[1])} from where its joints put it, allowed "
             f"{mm(MISPLACED)}: obstacles near it in the map may be the robot itself",
             value=camera[1],
@@ -239,7 +239,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     yield (
         passed_reason(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
         if value <= MISPLACED
-        else lacking(
+        else not_evaluable(
             sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
             f"joints put it, allowed {mm(MISPLACED)}",
             value=value,
@@ -265,11 +265,11 @@ def _blind_link(judged: Judged) -> Reason:
     by_link = judged.inputs.scene.figures().get("self_mask") or {}
     reaches = {link: 1e-3 * row.get("reach_mm", 0.0) for link, row in by_link.items()}
     blind = max(reaches, key=reaches.__getitem__, default="")
-    return lacking(sentence="", value=reaches.get(blind), who=blind)
+    return not_evaluable(sentence="", value=reaches.get(blind), who=blind)
 
 
 VOXEL = Bound(
-    on=lambda judged: lacking(sentence="", value=judged.inputs.scene.figures().get("voxel")),
+    on=lambda judged: not_evaluable(sentence="", value=judged.inputs.scene.figures().get("voxel")),
     at_most=COARSE_VOXEL,
     unit="m",
     say="the map has voxels of {mm}, allowed {allowed_mm} near a robot",

@@ -147,8 +147,8 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
     """Sentences on what the robot's spheres cover, by subject. by_surface: of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
-    if kept := [pair for pair in robot.pair_margins if pair.margin is not None]:
-        words["self_margins"] = _self_margin_words(robot, kept, config)
+    if own_margins := [pair for pair in robot.pair_margins if pair.margin is not None]:
+        words["self_margins"] = _self_margin_words(robot, own_margins, config)
     if by_surface:
         links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
         words["by_surface"] = (

@@ -29,7 +29,7 @@ from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, See
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
-HELD = 2  # scenes whose fields are kept: a rate of change needs two
+NUM_CACHED = 2  # scenes whose fields are kept: a rate of change needs two
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,11 +120,11 @@ class KnownScene:
 def fields_at(
     known_ns: Sequence[int], key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
 ) -> Callable[[int], KnownFields]:
-    """Return a lookup of the newest scene at a stamp; it keeps the last HELD.
+    """Return a lookup of the newest scene at a stamp; it keeps the last NUM_CACHED.
 
     The lookup raises NotEvaluableError before the first scene is known.
     """
-    cached = lru_cache(maxsize=HELD)(fields_of)
+    cached = lru_cache(maxsize=NUM_CACHED)(fields_of)
 
     def at(stamp_ns: int) -> KnownFields:
         index = bisect_right(known_ns, stamp_ns) - 1
@@ -196,7 +196,7 @@ def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: in
     def key_of(index: int) -> int | None:
         return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
 
-    @lru_cache(maxsize=HELD)
+    @lru_cache(maxsize=NUM_CACHED)
     def voxels(index: int) -> SeenVoxels | None:
         is_last = not has_times or index == len(stamps) - 1
         return scene.seen() if is_last else scene.snapshot_at(stamps[index]).seen()

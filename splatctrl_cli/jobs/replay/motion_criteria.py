@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, SLIGHTLY_UNDER
 from splatctrl_cli.control.columns import Event, EventKind
 from splatctrl_cli.evaluate.metrics import lowest
-from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, lacking, passed_reason, plural
+from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, not_evaluable, passed_reason, plural
 from splatctrl_cli.jobs.replay.criteria import (
     BROKEN,
     COMMANDED,
@@ -49,7 +49,7 @@ def certified_clearance(judged: Judged) -> Iterator[Reason]:
         return
     room, loss = exact - judged.threshold, exact - least
     voxel = judged.metrics.get("voxel") or 0.02
-    yield lacking(
+    yield not_evaluable(
         sentence=f"the grid is too coarse: its certified bound is {mm(least)}, its interpolated value {mm(exact)}, "
         f"margin {mm(judged.replay.margin)}",
         value=least,
@@ -86,7 +86,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     events = events_of(replay, EventKind.IN_COLLISION if is_contact else EventKind.BELOW_MARGIN, source)
     worst = min(events, key=lambda event: event.worst)
     if represented is not None:
-        starved = lacking(
+        starved = not_evaluable(
             sentence=f"{worst.worst_name} is {mm(least)} from occupied space without a splat, margin "
             f"{mm(replay.margin)} (the nearest splat is {mm(represented)} away)",
             value=least,
@@ -101,7 +101,7 @@ def _check_source(judged: Judged, source: str, represented: float | None = None)
     apart = f"penetrates the scene by {mm(-least)}" if least < 0 else f"is {mm(least)} from the scene"
     link, why = unlearned_link(judged) or ("", "")
     if link and worst.worst_name.startswith(f"{link}["):
-        part = lacking(
+        part = not_evaluable(
             sentence=f"{worst.worst_name} {apart}, margin {mm(replay.margin)}; the object is there from the first "
             f"state on and may be a part of {link}, which {why},",
             value=least,
@@ -288,13 +288,13 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
     model = judged.replay.model
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
     if np.isnan(deficit).any():
-        yield lacking(
+        yield not_evaluable(
             sentence=f"the coverage of the robot by its spheres is unknown: {model.coverage_unknown}",
             remedy="give a URDF with collision geometry (--packages finds its meshes)",
         )
         return
     if bare := bare_moving_links(judged.replay.model):
-        yield lacking(
+        yield not_evaluable(
             sentence=f"no sphere on {', '.join(bare)}: their clearance is unknown",
             who=bare[0],
             remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
@@ -303,7 +303,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
     if surface is None:
         return
     if surface < judged.threshold:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}, margin "
             f"{mm(judged.replay.margin)} (up to {mm(float(np.nanmax(deficit)))} of it lies outside them)",
             value=surface,
@@ -324,7 +324,7 @@ def clearance_between_states(judged: Judged) -> Iterator[Reason]:
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
         return
     if between < judged.threshold <= surface:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"on a straight path between two states the arm is at most {mm(between)} from the scene, margin "
             f"{mm(judged.replay.margin)}"
             if bool(trace["is_met"][int(np.nanargmin(trace["clearance_between"]))])

@@ -66,7 +66,7 @@ from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
-ASKED = ("--require",)  # criteria of the request itself
+REQUESTED = ("--require",)  # criteria of the request itself
 LARGER_IS_LAXER = (
     *("max_unknown", "max_map_age", "max_pose_jump", "allow_disagreement", "config.control.limit_tolerance"),
     *("config.verdict.unjudged", "config.verdict.lead_in", "config.verdict.longest_interval"),
@@ -199,7 +199,7 @@ class ReplayResult(JudgedResult):
 
         With `report_only` only the request's own gates set 1 or 5.
         """
-        return self.verdict.exit_code_of(ASKED if report_only else None) or (3 if self.is_damaged else 0)
+        return self.verdict.exit_code_of(REQUESTED if report_only else None) or (3 if self.is_damaged else 0)
 
 
 def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:

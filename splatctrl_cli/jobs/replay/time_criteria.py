@@ -8,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import CLOCKS_APART, SAME_MOMENT_NS
 from splatctrl_cli.control.columns import runs_of
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, lacking, plural
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed, not_evaluable, plural
 from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Judged, mm, worst_state
 
 
@@ -19,7 +19,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     for later in judged.replay.unwatched:
         since, until, when = ((ns - first_ns) * 1e-9 for ns in (later.since_ns, later.depth_ns, later.stamp_ns))
-        yield lacking(
+        yield not_evaluable(
             sentence=f"no camera gave depth near the arm from {since:.2f} to {until:.2f} s, and then an obstacle "
             f"is {mm(later.clearance)} from the arm's place, margin {mm(margin)},",
             value=later.clearance,
@@ -97,7 +97,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
     yield from _overtaken(judged)
     has_clock = judged.inputs.source.has_clock
     if np.isnan(judged.replay.trace["map_age_s"]).all() and judged.request.field is not None and has_clock:
-        yield lacking(
+        yield not_evaluable(
             sentence="the baked field has no time",
             remedy="give --scene, or bake a reconstruction instead of bare splats",
             count=judged.replay.num_states,
@@ -121,7 +121,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
             label=CONTACT if worst.clearance < 0 else MARGIN,
         )
     for last in [each for each in overtaken if each.depth_ns > each.stamp_ns][:1]:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"the next depth, {(last.depth_ns - last.stamp_ns) * 1e-9:.2f} s after the last state, shows an "
             f"obstacle {mm(last.clearance)} from the arm, margin {mm(margin)},",
             value=last.clearance,
@@ -141,7 +141,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     config, replay = judged.request.config.verdict, judged.replay
     stamps, unbounded, blank = replay.trace.stamp_ns, replay.trace["unbounded_s"], replay.trace["is_blank"]
     if blank.any():
-        yield lacking(
+        yield not_evaluable(
             criterion="judged states",
             sentence=f"the path leaves known space: at {int(blank.sum())} of {len(stamps)} states a sphere is where "
             "the field has no distance, first",
@@ -154,7 +154,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
     if (share := float(unbounded.sum()) / duration) > config.unjudged:
         longest = int(np.argmax(unbounded))
-        yield lacking(
+        yield not_evaluable(
             sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
             f"the motion ({plural(int((unbounded > 0).sum()), 'gap')}, the longest {unbounded[longest]:.2f} s, "
             "ending",
@@ -167,7 +167,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
         )
     dropped = judged.inputs.source.loss.conflicting_states
     if dropped > config.unjudged * (dropped + len(stamps)):
-        yield lacking(
+        yield not_evaluable(
             criterion="judged states",
             sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
             value=float(dropped),
@@ -176,7 +176,7 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             count=len(stamps),
         )
     if replay.lead_in_s > config.lead_in:
-        yield lacking(
+        yield not_evaluable(
             sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first "
             "map",
             value=replay.lead_in_s,
@@ -193,7 +193,7 @@ def _clock_offset(judged: Judged) -> Reason | None:
         return None
     side = "ahead of" if clock.offset_s > 0 else "behind"
     words = f"{side} the robot's (+- {1e3 * clock.uncertainty_s:.0f} ms)"
-    return lacking(sentence=words, value=abs(float(clock.offset_s)), count=clock.num_intervals)
+    return not_evaluable(sentence=words, value=abs(float(clock.offset_s)), count=clock.num_intervals)
 
 
 CLOCKS = Bound(

@@ -328,5 +328,5 @@ def view(request: ViewRequest) -> Result:
         page,
         num_splats=max(map(len, space.splats.values()), default=0),
         num_states=0 if space.motion is None else len(space.motion.seconds),
-        num_unknown=0 if space.unknown is None else len(space.unknown[0]),
+        num_unknown=sum(len(points) for points, _ in space.unknown.values()),
     )

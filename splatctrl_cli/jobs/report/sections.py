@@ -203,6 +203,6 @@ def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple
         rows=[*first, *rows(worse), *unlike],
         text=". ".join([comparison.verdict.sentence, *map(str, comparison.verdict.shown)]),
     )
-    folded = Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
-    tables = [changed, folded] if better else [changed]
+    improved = Table(title=f"Figures that got better ({len(better)})", header=HEADER, rows=better, is_folded=True)
+    tables = [changed, improved] if better else [changed]
     return tables, frozenset([one["run"] for one in comparison.verdicts] + [one.run for one in worse])

@@ -22,9 +22,17 @@ from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.page import Motion, Space, Surface, bodies_of, coarsen
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import sphere_names
-from splatctrl_cli.voxels import OccupancyGrid, VoxelState
+from splatctrl_cli.voxels import EvidenceClass, VoxelState
 
-MOST_UNKNOWN = 6000  # cubes of space never seen
+MOST_UNKNOWN = 6000  # cubes of space without evidence
+SHELL = {
+    EvidenceClass.HIDDEN_BY_ARM: "hidden by the arm",
+    EvidenceClass.HIDDEN_BY_THING: "hidden by an object",
+    EvidenceClass.OUT_OF_VIEW: "out of view",
+    EvidenceClass.NO_RETURN: "no return",
+    EvidenceClass.CONTRADICTED: "contradicted",
+    EvidenceClass.UNANSWERED: "depth expected, none",
+}
 PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 
@@ -57,7 +65,7 @@ def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def space_of_scene(scene: SceneFolder) -> Space:
     if scene.is_anisotropic:
         return Space(splats={0.0: nearest_splats(scene.gaussians())})
-    return _add_seen(Space(splats={0.0: scene.splats()}), scene.occupancy(), scene)
+    return _add_seen(Space(splats={0.0: scene.splats()}), scene, scene)
 
 
 def space_of_grid(path: Path) -> Space:
@@ -76,10 +84,10 @@ def space_of_grid(path: Path) -> Space:
         surface = Surface(vertices=mesh.vertices.astype(np.float32), faces=mesh.faces.astype(np.uint32))
     except NotEvaluableError:
         surface = None
-    unknown = None
+    unknown = {}
     if "observed" in grid.channels:
         is_unknown = np.asarray(grid.channels["observed"]) == VoxelState.NEVER_SEEN
-        unknown = coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN)
+        unknown["never seen"] = coarsen(is_unknown, grid.origin, grid.voxel, MOST_UNKNOWN)
     return Space(surface=surface, unknown=unknown)
 
 
@@ -94,7 +102,7 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
     """Robot of a replay, by its command line or log. Raises InputError for missing files."""
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
-    places = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
+    places = {name: _file(run, file, roots) for name, file in files.items() if file is not None}
     if files["urdf"] is None and run.parts.has(run.path / ROBOT):
         places["urdf"] = run.parts.checked(run.path / ROBOT)
     refuse_if(
@@ -149,7 +157,7 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     chosen = spread(times, when)
     sets = {times[i] if n else 0.0: used[i].splats() for n, i in enumerate(chosen)}
     at = max((i for i in chosen if times[i] <= when), default=None)
-    return _add_seen(Space(splats=sets), None if at is None else used[at].occupancy(), scene)
+    return _add_seen(Space(splats=sets), None if at is None else used[at], scene)
 
 
 def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
@@ -187,14 +195,19 @@ def spread(times: list[float], when: float) -> list[int]:
     return sorted({*even, at})
 
 
-def _add_seen(space: Space, grid: OccupancyGrid | None, scene: SceneFolder) -> Space:
-    """Add cameras at their start, and space that they never saw."""
+def _add_seen(space: Space, known: SceneFolder | Snapshot | None, scene: SceneFolder) -> Space:
+    """Add cameras at their start, and the space without evidence, by class."""
     space = replace(space, cameras=[_camera(row) for row in scene.made_from.get("first_frames", [])])
-    if grid is None:
+    seen = None if known is None else known.seen()
+    if seen is None:
         return space
-    used: Mapping[str, Any] = scene.run.get("config", {}).get("occupancy", {})
-    states = grid.states(float(used.get("free_below", 0.3)), float(used.get("occupied_above", 0.7)))
-    return replace(space, unknown=coarsen(states == VoxelState.NEVER_SEEN, grid.origin, grid.voxel, MOST_UNKNOWN))
+    cells = np.indices(seen.last_seen.shape).reshape(3, -1).T
+    classes = seen.look(seen.origin + seen.voxel * cells)[1].reshape(seen.last_seen.shape)
+    shell = {
+        name: coarsen(classes == evidence, seen.origin, seen.voxel, MOST_UNKNOWN // len(SHELL))
+        for evidence, name in SHELL.items()
+    }
+    return replace(space, unknown=shell)
 
 
 def _camera(first_frame: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,8 +30,8 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 class RobotOptions:
     """Options to read a robot's URDF.
 
-    spheres: None for the URDF's. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw. locked:
-    values [rad or m] of unlogged joints.
+    spheres: None for `default_spheres`. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw.
+    locked: values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
@@ -84,14 +84,14 @@ def installed_urdf(name: str) -> Path:
     )
 
 
-def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
+def urdf_of(urdf: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
     """Robot of --urdf, else of the logs, with a warning if they differ.
 
     Raises InputError.
     """
-    if given is None:
+    if urdf is None:
         return logged_urdf(paths)
-    file = read_urdf(given)
+    file = read_urdf(urdf)
     if words := differs(file, paths):
         progress.log(f"warning: {words}; {TAKE}")
     return file

@@ -214,15 +214,15 @@ def deciding_versions() -> dict[str, str]:
 
 
 @contextmanager
-def advise_resumption(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
+def advise_resumption(checkpoint: Path, folder: Path | None = None) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
         if not checkpoint.is_file():
             raise KeyboardInterrupt("interrupted before its first checkpoint; run the same command again") from None
-        kept = kept or checkpoint.parent.parent
+        folder = folder or checkpoint.parent.parent
         raise KeyboardInterrupt(
-            f"interrupted: {kept} is kept; continue it with the same command and --resume"
+            f"interrupted: {folder} is kept; continue it with the same command and --resume"
         ) from None
 
 

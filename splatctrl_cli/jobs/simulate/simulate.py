@@ -28,7 +28,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
 from splatctrl_cli.robot.self_margins import SelfSurfaces
 from splatctrl_cli.robot.sphere_files import spheres_yaml
-from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.sphere_fit import default_spheres
 from splatctrl_cli.robot.urdf import MeshShape, UrdfFile, read_urdf
 from splatctrl_cli.simulate.arm import SHAPES, SLIM, Motion, arm_spheres_yaml, arm_urdf, hand_pose
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, luminance_std
@@ -190,22 +190,21 @@ REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
 def copy_arm(
-    urdf: Path, given: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
+    urdf: Path, sphere_file: Path | None, packages: Sequence[Path], folder: Path, progress: Progress
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    Spheres are `given`, or fitted. Raises InputError without collision geometry or meshes.
+    Spheres are `sphere_file`, or fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
     copy = folder / "robot.urdf"
     copy.write_text(_copy_meshes(original, packages, folder, progress), encoding="utf-8")
     spheres = folder / "robot_spheres.yaml"
-    if given is not None:
-        shutil.copyfile(given, spheres)
+    if sphere_file is not None:
+        shutil.copyfile(sphere_file, spheres)
     else:
-        fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
-        spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
+        spheres.write_text(spheres_yaml(default_spheres(original, packages)), encoding="utf-8")
     moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
     model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
     model = model.replace_coverage(

@@ -214,12 +214,12 @@ def _simulation_of(replayed: Stage) -> RunFolder:
 def _add_simulation(simulation: RunFolder, stages: Sequence[Stage], command_line: CommandLine) -> list[Stage]:
     folder = simulation.path
     log, logs = folder / "log.mcap", ("log", "source", "seen-by")
-    for given in [Path(stage.options[option]) for stage in stages for option in logs if option in stage.options]:
-        header = given / "capture.json"
-        sources = json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(given),)
+    for recording in [Path(stage.options[option]) for stage in stages for option in logs if option in stage.options]:
+        header = recording / "capture.json"
+        sources = json.loads(header.read_text())["sources"].values() if header.is_file() else (sha256(recording),)
         refuse_if(
             sha256(log) not in sources,
-            f"{given}: is not the recording of {folder}",
+            f"{recording}: is not the recording of {folder}",
             remedy=f"replay {log}",
             error=UsageError,
         )

@@ -110,7 +110,7 @@ class DeviceField:
         return self._answered("query", arguments, (len(points),), len(points), wanted, 0.0)
 
     def _answered(
-        self, what: str, asked: Mapping[str, Array | int], shape: tuple[int, ...], num_warps: int,
+        self, what: str, query: Mapping[str, Array | int], shape: tuple[int, ...], num_warps: int,
         wanted: Collection[str], margin: float,
     ) -> Answers:  # fmt: skip
         num, launches = int(np.prod(shape)), []
@@ -121,7 +121,7 @@ class DeviceField:
         entry = self._room("entry", 4 * num) if "entry" in wanted else 0
         for name, base in self._tasks.items():
             task = base.copy()
-            for key, value in asked.items():
+            for key, value in query.items():
                 task[key] = value
             task["out"] = (*places[name], entry if name == HARD else 0)
             kernel = HARD if name == HARD else "matern" if self._kernels[name].is_matern else "gaussian"

@@ -160,7 +160,7 @@ def _lose(stream: _Stream, numbers: list[int]) -> None:
 
 
 SUFFIXES = (".mp4", ".mkv", ".mov", ".avi")
-_BESIDE = ("{}.csv", "{}.txt", "{}_timestamps.csv", "{}_timestamps.txt")
+_STAMP_FILES = ("{}.csv", "{}.txt", "{}_timestamps.csv", "{}_timestamps.txt")
 _UNITS_NS = ((11, SECOND_NS), (14, 1_000_000), (17, 1_000), (99, 1))  # by at most so many digits before the point
 _TIME = re.compile("time|stamp", re.IGNORECASE)
 
@@ -190,7 +190,7 @@ class VideoFileLog(RawLog):
     def __init__(self, path: Path) -> None:
         self.path = path
         folder = require(
-            next((file for form in _BESIDE if (file := path.with_name(form.format(path.stem))).is_file()), None),
+            next((file for form in _STAMP_FILES if (file := path.with_name(form.format(path.stem))).is_file()), None),
             f"{path}: expected a file of stamps next to it, got none",
             remedy=f"write {path.stem}.csv, a line for each image: its time in seconds"
             + (f"; if an Azure Kinect recorded it, {AZURE_KINECT}" if path.suffix.lower() == ".mkv" else ""),

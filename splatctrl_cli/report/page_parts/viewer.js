@@ -1,8 +1,8 @@
 "use strict";
 // A scene in 3-D: splats as round Gaussians sorted by depth, the arm at the slider's state, what decided the verdict.
 
-const INK = {arm: 0xa9b6c0, path: 0x0072b2, near: 0xe69f00, hit: 0xd55e00, unknown: 0x96789f, surface: 0x78a0c8};
-const LABELS = ["objects", "robot", "people"];
+const INK = {arm: 0xa9b6c0, path: 0x0072b2, near: 0xe69f00, hit: 0xd55e00, surface: 0x78a0c8};
+const LABELS = ["objects", "robot", "people"], SHELL = [0xcc79a7, 0xe69f00, 0x96789f, 0x56b4e9, 0xd55e00, 0x009e73];
 const EXTENT = 3.0;  // sigmas of a splat that are drawn
 const TYPES = {uint8: Uint8Array, uint16: Uint16Array, int16: Int16Array, uint32: Uint32Array, float32: Float32Array};
 
@@ -124,12 +124,12 @@ class Viewer {
 
   addRest() {
     const {unknown, surface} = this.header;
-    if (unknown) {
-      const points = this.arrays.points(unknown.points), count = points.length / 3, ink = new THREE.Color(INK.unknown);
+    for (const [index, {name, points: coded, edge}] of unknown.entries()) {
+      const points = this.arrays.points(coded), count = points.length / 3, ink = new THREE.Color(SHELL[index]);
       const colors = Float32Array.from({length: 4 * count}, (_, k) => [ink.r, ink.g, ink.b, 0.35][k % 4]);
-      const node = sprites(points, new Float32Array(count).fill(0.5 * unknown.edge), colors, SQUARE);
-      this.sorted.push(node);
-      this.part("never seen", node, !this.header.motion && !this.header.splats.length && !surface);
+      const node = sprites(points, new Float32Array(count).fill(0.5 * edge), colors, SQUARE);
+      this.sorted.push(Object.assign(node, {ink: `color: #${ink.getHexString()}`}));
+      this.part(name, node, !this.header.motion && !this.header.splats.length && !surface);
     }
     if (surface) {
       const geometry = this.arrays.mesh(surface);
@@ -212,7 +212,7 @@ class Viewer {
     cameras.forEach(({name}, k) => add("option", menu, {value: k, textContent: name}));
     const ticks = add("div", this.host, {className: "ticks"});
     for (const [name, group] of Object.entries(this.parts)) {
-      const label = add("label", ticks);
+      const label = add("label", ticks, {style: group.children[0].ink ?? ""});
       const change = (event) => { group.visible = event.target.checked; this.draw(); };
       add("input", label, {type: "checkbox", checked: group.visible, onchange: change});
       label.append(" " + name);

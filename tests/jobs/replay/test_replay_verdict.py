@@ -11,7 +11,7 @@ from splatctrl_cli.checks.clock_offset import ClockOffset
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config.fixed import UNSEEN
 from splatctrl_cli.jobs.replay import replay as job
-from splatctrl_cli.jobs.replay.replay import ASKED, CRITERIA
+from splatctrl_cli.jobs.replay.replay import CRITERIA, REQUESTED
 from tests.cli.replay_desk import SECOND, START, grid_seen
 from tests.jobs.replay.broken import (
     ALONE,
@@ -81,7 +81,7 @@ def test_one_criterion_that_is_broken_turns_the_verdict_and_names_itself(stage: 
     code, verdict = stage.judged(*arguments)
     assert set(decisive(verdict)) == {criterion} and (verdict["label"], code) == (label, CODES.get(label, 1))
     assert words in verdict["sentence"]
-    assert not criterion.startswith(ASKED), "with --report-only it turns no exit code"
+    assert not criterion.startswith(REQUESTED), "with --report-only it turns no exit code"
 
 
 def test_a_broken_margin_says_when_where_and_who(stage: Stage) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,10 +20,13 @@ from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.geometry import look_at, transform_from
 from splatctrl_cli.jobs.compare.compare import CompareRequest, compare
 from splatctrl_cli.jobs.report.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
-from splatctrl_cli.jobs.report.spaces import space_of
+from splatctrl_cli.jobs.report.spaces import space_of, space_of_scene
 from splatctrl_cli.jobs.runs.run_folder import States, open_run
+from splatctrl_cli.report.page import pack
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import SeenVoxels, Unseen
 from tests.jobs.stage import Runs, Stage, passing, patch_json
+from tests.plain import plain_splats
 from tests.refused import expect_refusal
 from tests.report.browser import found_on
 
@@ -396,3 +400,21 @@ def test_the_moment_shown_is_of_the_clearance_that_the_verdict_judges() -> None:
     np.testing.assert_array_equal(states.judged, measures["exact"])
     assert replace(states, clearance={"barrier": measures["barrier"]}).worst() == 0
     assert replace(states, clearance={}).worst() is None
+
+
+def test_space_without_evidence_is_drawn_by_its_reason() -> None:
+    last_seen = np.ones((12, 12, 12), np.uint16)
+    last_seen[2:5, 2:5, 2:5], last_seen[7:9, 7:9, 7:9] = Unseen.HIDDEN_BY_ARM, Unseen.NO_RETURN
+    last_seen[0] = Unseen.SWEPT
+    seen = SeenVoxels(origin=np.ones(3), voxel=0.1, last_seen=last_seen, step_stamps_ns=np.array([7]))
+    scene = SimpleNamespace(
+        is_anisotropic=False, made_from={}, splats=lambda: plain_splats([[1.0, 1.0, 1.0]], [0.01]), seen=lambda: seen
+    )
+    unknown = space_of_scene(scene).unknown  # type: ignore[arg-type]
+    assert {name: len(points) for name, (points, _) in unknown.items() if len(points)} == {
+        "hidden by the arm": 26,
+        "no return": 8,
+    }
+    np.testing.assert_allclose(unknown["no return"][0].min(axis=0), 1.7, atol=1e-6)
+    header = json.loads(pack(space_of_scene(scene)))["header"]  # type: ignore[arg-type]
+    assert [each["name"] for each in header["unknown"]] == ["hidden by the arm", "no return"]

@@ -15,11 +15,11 @@ from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.jobs.simulate import simulate as job
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.robot import sphere_fit
 from splatctrl_cli.robot.link_meshes import MeshDistance
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_fit import FitOptions
@@ -40,11 +40,12 @@ FINGERS = "".join(
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_turns() -> Iterator[None]:
+def few_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Try few turns of the tip, and few patches for spheres, for speed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fixed, "SIMULATED_TURNS", 2)
-        patch.setattr(job, "FitOptions", partial(FitOptions, restarts=1, num_patches=500, num_candidates=600))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("fits")))
+        patch.setattr(sphere_fit, "FitOptions", partial(FitOptions, restarts=1, num_patches=500, num_candidates=600))
         yield
 
 
