@@ -82,7 +82,9 @@ def default_spheres(urdf: UrdfFile, packages: Sequence[Path] = ()) -> SphereSet:
 def _cached_fit(urdf: UrdfFile, packages: Sequence[Path]) -> Path:
     meshes = (mesh_path(urdf.path, mesh, packages).read_bytes() for mesh in urdf.meshes)
     digest = hashlib.sha256(b"\0".join([__version__.encode(), urdf.text.encode(), *meshes])).hexdigest()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatctrl" / f"spheres-{digest}.yaml"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME", ""), ".cache"))
+    stored = folder if folder.is_absolute() else Path(os.devnull)  # nowhere
+    return stored / "splatctrl" / f"spheres-{digest}.yaml"
 
 
 def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:

@@ -159,8 +159,11 @@ def test_a_urdf_without_spheres_is_fitted_once_and_again_if_it_or_a_mesh_changes
     RobotModel.from_urdf(path)
     assert len(fits) == 4
     (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    np.testing.assert_array_equal(RobotModel.from_urdf(path).sphere_set.radii, default_spheres(read_urdf(path)).radii)
+    monkeypatch.chdir(tmp_path)
+    for folder in (str(tmp_path / "file"), "here"):  # a relative folder would be another one in each run
+        monkeypatch.setenv("XDG_CACHE_HOME", folder)
+        assert RobotModel.from_urdf(path).sphere_set.radii.all()
+    assert not (tmp_path / "here").exists()
     own = arm_of('<sphere radius="0.1"/>', '<sphere radius="0.2"/>')
     assert default_spheres(read_urdf(written(tmp_path, own))).radii.tolist() == [0.1, 0.2]
     assert len(fits) == 6
