@@ -202,11 +202,11 @@ MESH = '<collision><geometry><mesh filename="package://r/a.stl"/></geometry></co
     ("text", "recipe", "words"),
     [
         (robot(), {}, ""),
-        (robot(shape=MESH), {}, "; give a spheres YAML file"),
+        (robot(shape=MESH), {}, "mesh package://r/a.stl was not found; give the folder that holds its package"),
         (robot(root="base"), {}, "the poses are in the frame 'world', not in that of its root 'base'"),
         (robot(), {"has_joints": False}, "expected joint states, got none"),
     ],
-    ids=["it can", "no spheres", "elsewhere", "no states"],
+    ids=["it can", "no meshes", "elsewhere", "no states"],
 )
 def test_a_reconstruction_leaves_the_robot_of_the_log_out_where_it_can(
     tmp_path: Path, text: str, recipe: dict[str, bool], words: str
