@@ -160,8 +160,8 @@ def pack(space: Space) -> str:
         ],
         "cameras": list(space.cameras),
         "unknown": [
-            {"name": name, "points": _points(block, points), "edge": edge}
-            for name, (points, edge) in space.unknown.items()
+            {"name": name, "points": _points(block, points), "edge": edge, "shade": shade}
+            for shade, (name, (points, edge)) in enumerate(space.unknown.items())
             if len(points)
         ],
     }

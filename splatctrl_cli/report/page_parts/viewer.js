@@ -124,8 +124,8 @@ class Viewer {
 
   addRest() {
     const {unknown, surface} = this.header;
-    for (const [index, {name, points: coded, edge}] of unknown.entries()) {
-      const points = this.arrays.points(coded), count = points.length / 3, ink = new THREE.Color(SHELL[index]);
+    for (const {name, points: coded, edge, shade} of unknown) {
+      const points = this.arrays.points(coded), count = points.length / 3, ink = new THREE.Color(SHELL[shade]);
       const colors = Float32Array.from({length: 4 * count}, (_, k) => [ink.r, ink.g, ink.b, 0.35][k % 4]);
       const node = sprites(points, new Float32Array(count).fill(0.5 * edge), colors, SQUARE);
       this.sorted.push(Object.assign(node, {ink: `color: #${ink.getHexString()}`}));

@@ -417,4 +417,5 @@ def test_space_without_evidence_is_drawn_by_its_reason() -> None:
     }
     np.testing.assert_allclose(unknown["no return"][0].min(axis=0), 1.7, atol=1e-6)
     header = json.loads(pack(space_of_scene(scene)))["header"]  # type: ignore[arg-type]
-    assert [each["name"] for each in header["unknown"]] == ["hidden by the arm", "no return"]
+    shades = {each["name"]: each["shade"] for each in header["unknown"]}
+    assert shades == {"hidden by the arm": 0, "no return": 3}  # a reason has its colour on every page
