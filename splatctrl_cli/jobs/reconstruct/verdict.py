@@ -7,7 +7,7 @@ from typing import Any
 from splatctrl_cli.calibration.displacement import is_corrected, is_displaced
 from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, gate_reasons, note, plural, verdict_of
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.time_steps import AuditRow
@@ -56,7 +56,8 @@ def reconstruct_verdict(run: Reconstructed, require: Sequence[str]) -> Verdict:
             *_notes(metrics, run.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
-        scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
+        scope=f"{plural(metrics['time_steps'], 'time step')} of {', '.join(metrics['cameras'])},"
+        f" {plural(metrics['splats'], 'splat')}",
         notes=[*run.learned, *(carried_words(entry) for entry in metrics["carried"])],
         is_damaged=bool(run.loss.damaged),
         counts=counts,
