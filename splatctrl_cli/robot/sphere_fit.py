@@ -265,7 +265,9 @@ class _Link:
         return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
 
     def _reach(self, centers: Float64) -> Float64:
-        return np.asarray(cdist(centers, self._vertices)[:, self._faces].max(axis=2) + self._slack)
+        away = cdist(self._vertices, centers)
+        first, second, third = self._faces.T  # rows (patches, n) are read in one piece each
+        return np.asarray(np.maximum(np.maximum(away[first], away[second]), away[third]) + self._slack[:, None]).T
 
     def _lattice(self, patches: Float64) -> tuple[Float64, float]:
         lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
