@@ -29,7 +29,7 @@ from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, See
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
-NUM_CACHED = 2  # scenes whose fields are kept: a rate of change needs two
+NUM_CACHED = 3  # scenes whose fields are kept: the last, this and the next
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,8 +45,8 @@ class KnownFields:
     distances: Mapping[str, DistanceFunction]
     median_radius: float
     obstacles: Callable[[Float64], tuple[Obstacle, ...]]
+    splats_alone: DistanceFunction
     human: DistanceField | None = None
-    splats_alone: DistanceFunction | None = None
     is_person: Bool | None = None
     balls: BallDistance | None = None
 
@@ -148,10 +148,12 @@ def read_grid_scene(path: Path) -> KnownScene:
     observed = None if states is None else partial(observed_at, states.astype("uint8"), grid.origin, grid.voxel)
     seen = None if observed is None else _grid_seen(observed, grid)
     made_from = origins if isinstance(origins := grid.header.get("made_from"), dict) else {}
+    exact = _distance(GridField(replace(grid, channels={"sdf": exact_channel(grid)})))
     fields = KnownFields(
         barrier=barrier,
+        splats_alone=exact,
         distances={
-            "exact": _distance(GridField(replace(grid, channels={"sdf": exact_channel(grid)}))),
+            "exact": exact,
             "barrier": _distance(barrier),
             "certified": barrier.certified,
         },
@@ -270,14 +272,14 @@ def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: 
         obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
         is_person=people,
-        splats_alone=_splats_alone(obstacles, threads),
+        splats_alone=_splats_alone(obstacles, balls, threads),
         balls=balls if human is None or config.control.human_margin <= config.control.margin else None,
     )
 
 
-def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction | None:
+def _splats_alone(obstacles: ObstacleSpheres, balls: BallDistance, threads: int) -> DistanceFunction:
     if not obstacles.num_unrepresented:
-        return None
+        return balls
     is_splat = obstacles.index != NO_SPLAT
     centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
     if not len(radii):

@@ -1,6 +1,6 @@
 """States of a replay, measured and stored block by block."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -11,6 +11,7 @@ from splatctrl_cli.config import Config, fixed
 from splatctrl_cli.control.audit import (
     AuditTrace,
     Clearance,
+    DistanceFunction,
     Reach,
     audit,
     between_states,
@@ -126,7 +127,7 @@ class ReplayRecord:
         """Audit and store the next block of states (T, J), which see one scene."""
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
-        part = self._look_at_self(self._drop_expected(part))
+        part = self._look_at_self(self._judge_scene(part))
         self.fields = tuple(part.clearance)
         self.newer_depth.add(stamps, positions, part.clearance["exact"].distance)
         strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
@@ -165,21 +166,47 @@ class ReplayRecord:
 
         return events_of(trace.stamp_ns, signals, near)
 
-    def _drop_expected(self, part: AuditTrace) -> AuditTrace:
-        if not self._declared.expected_contact:
-            return part
+    def _judge_scene(self, part: AuditTrace) -> AuditTrace:
+        """Leave declared contact out, and let objects come nearer before the next map."""
         clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
         known = self._scene.at(int(part.stamp_ns[0]))
         for name, each in part.of_spheres.items():
-            unexpected = of_spheres[name] = self._unexpected(known, part.stamp_ns, part.position, each)
-            nearest = unexpected.argmin(axis=1)
-            clearance[name] = Clearance(
-                distance=unexpected[np.arange(len(unexpected)), nearest], sphere=moving[nearest]
-            )
+            judged = self._unexpected(known, part.stamp_ns, part.position, each)
+            if name == "exact":
+                judged = self._approached(
+                    part.stamp_ns, part.position, judged, lambda later: later.distances["exact"]
+                )
+            of_spheres[name], nearest = judged, judged.argmin(axis=1)
+            clearance[name] = Clearance(distance=judged[np.arange(len(judged)), nearest], sphere=moving[nearest])
         return replace(part, clearance=clearance, of_spheres=of_spheres)
+
+    def _approached(
+        self, stamps: Stamps, positions: Float64, each: Float64, pick: Callable[[KnownFields], DistanceFunction]
+    ) -> Float64:
+        """Clearances `each` (T, M) [m], lowered linearly in time to the next map's.
+
+        So objects come nearer evenly. Maps known late, or over `UNWATCHED_NS` apart, change nothing. pick: the distance of a map.
+        """
+        scene, now_ns = self._scene, int(stamps[0])
+        first, next_ns = scene.depth_ns(now_ns), scene.next_ns(now_ns)
+        if first is None or next_ns is None or next_ns != scene.depth_ns(next_ns):
+            return each
+        if next_ns - first > fixed.UNWATCHED_NS:
+            return each
+        known = scene.at(next_ns)
+        later = self._clearances_in(known, self._model, stamps, positions, pick(known))
+        share, is_lower = (stamps - first) / (next_ns - first), (later < each) & np.isfinite(each)
+        return each + share[:, None] * np.subtract(later, each, out=np.zeros_like(each), where=is_lower)
+
+    def _clearances_in(
+        self, known: KnownFields, robot: RobotModel, stamps: Stamps, positions: Float64, distance_to: DistanceFunction
+    ) -> Float64:
+        return self._unexpected(known, stamps, positions, moving_clearance(robot, positions, distance_to)[1])
 
     def _unexpected(self, known: KnownFields, stamps: Stamps, positions: Float64, each: Float64) -> Float64:
         """Clearances `each` (T, M) [m] of moving spheres, infinite where contact is declared."""
+        if not self._declared.expected_contact:
+            return each
         links, unexpected = self._model.sphere_set.links, each.copy()
         for state, column in zip(*np.nonzero(each < self._margin), strict=True):
             sphere = int(self._reach.moving[column])
@@ -195,8 +222,8 @@ class ReplayRecord:
         for its in np.split(np.arange(len(stamps)), np.searchsorted(stamps, self._robot.changes)):
             if len(its):
                 robot = self._robot.at(int(stamps[its[0]]))
-                each = moving_clearance(robot, positions[its], known.distances["exact"])[1]
-                gaps.append(self._unexpected(known, stamps[its], positions[its], each).min(axis=1))
+                each = self._clearances_in(known, robot, stamps[its], positions[its], known.distances["exact"])
+                gaps.append(each.min(axis=1))
         return np.concatenate(gaps)
 
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
@@ -289,11 +316,13 @@ class ReplayRecord:
         return columns
 
     def _clearance_of_splats(self, part: AuditTrace) -> Float64:
-        exact = part.clearance["exact"].distance
-        alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
-        low = np.flatnonzero(exact < self._margin - fixed.SLIGHTLY_UNDER)
-        if splats_alone is not None and len(low):
-            alone[low] = moving_clearance(self._model, part.position[low], splats_alone)[0].distance
+        alone, splats = part.clearance["exact"].distance.copy(), attrgetter("splats_alone")
+        low = np.flatnonzero(alone < self._margin - fixed.SLIGHTLY_UNDER)
+        if len(low):
+            stamps, positions = part.stamp_ns[low], part.position[low]
+            known = self._scene.at(int(stamps[0]))
+            each = self._clearances_in(known, self._model, stamps, positions, splats(known))
+            alone[low] = self._approached(stamps, positions, each, splats).min(axis=1)
         return alone
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:

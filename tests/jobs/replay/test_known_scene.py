@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from experiments.problems import simulated_arm
-from splatctrl_cli.config import Config
-from splatctrl_cli.control.audit import BallDistance
+from splatctrl_cli.config import Config, ControlConfig
+from splatctrl_cli.control.audit import BallDistance, DistanceFunction
 from splatctrl_cli.control.columns import Obstacle
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import NotEvaluableError
@@ -18,7 +18,7 @@ from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs.replay.known_scene import KnownFields, KnownScene, fields_at, known_space, splat_fields
 from splatctrl_cli.jobs.replay.state_pass import ReplayRecord, blocks_of
-from splatctrl_cli.records import Float64, Index, UInt8
+from splatctrl_cli.records import DistanceField, Float64, Index, UInt8
 from splatctrl_cli.robot.self_model import ALWAYS
 from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.voxels import SWEPT, EvidenceClass, VoxelState
@@ -103,18 +103,64 @@ def test_an_obstacle_comes_to_a_fixed_link_where_space_was_free_before(
     assert least == (pytest.approx(-0.01, abs=0.03) if has_come else first)
 
 
+def fields_of(distance: DistanceFunction, barrier: DistanceField) -> KnownFields:
+    """A scene of one distance whose obstacles have no place."""
+    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
+    return KnownFields(
+        barrier=barrier,
+        distances={"exact": distance, "barrier": distance},
+        median_radius=0.01,
+        obstacles=lambda points: (nothing,) * len(points),
+        splats_alone=distance,
+    )
+
+
+@pytest.mark.parametrize(
+    ("heights", "depth_ms", "latency_ms", "first_ms", "shares"),
+    [
+        pytest.param((0.3, 0.2), 100, 0, 0, [0.0, 0.25, 0.5, 0.75, 1.0], id="what comes nearer is met on its way"),
+        pytest.param((0.2, 0.3), 100, 0, 0, [0.0, 0.0, 0.0, 0.0, 1.0], id="what leaves stays until it is seen gone"),
+        pytest.param((0.3, 0.2), 500, 0, 0, [0.0, 0.05, 0.1, 0.15, 0.2], id="half a second apart"),
+        pytest.param((0.3, 0.2), 600, 0, 200, [0.0, 0.0, 0.0, 0.0, 0.0], id="too far apart"),
+        pytest.param((0.3, 0.2), 100, 20, 20, [0.0, 0.0, 0.0, 0.0, 1.0], id="a late map is as the robot knew it"),
+    ],
+)
+def test_an_object_comes_nearer_evenly_between_two_maps(
+    heights: tuple[float, float], depth_ms: int, latency_ms: int, first_ms: int, shares: list[float]
+) -> None:
+    """Balls below the hand in the maps of two times; states each 25 ms from first_ms on."""
+    model, q = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785])
+    hand, unit = model.sphere_centers(q)[-1], SECOND // 1000
+    moving = model.moving_spheres
+    balls = [SphereField(Spheres.of((hand - high * np.eye(3)[2])[None], np.array([1e-6]))) for high in heights]
+    maps = [fields_of(lambda points, ball=ball: ball.query(points)[0], ball) for ball in balls]  # type: ignore[misc]
+    stamps_ns = (0, depth_ms * unit)
+    known_ns = tuple(stamp + latency_ms * unit for stamp in stamps_ns)
+    scene = KnownScene(
+        at=lambda stamp: maps[int(stamp >= known_ns[1])],
+        observed=None,
+        first_ns=None,
+        cameras=None,
+        digests={},
+        stamps_ns=stamps_ns,
+        known_ns=known_ns,
+    )
+    record = ReplayRecord(model, scene, config=Config(control=ControlConfig(margin=0.5)), max_map_age=1.0)
+    stamps = first_ms * unit + np.arange(5) * SECOND // 40
+    for first, last in blocks_of(scene, model, stamps):
+        record.measure_block(stamps[first:last], np.tile(q, (last - first, 1)), np.zeros((last - first, 7)))
+    far, near = (min((ball.query(model.sphere_centers(q))[0] - model.sphere_set.radii)[moving]) for ball in balls)
+    expected = far + np.array(shares) * (near - far)
+    assert record.trace["clearance_exact"] == pytest.approx(expected, abs=1e-6)
+    assert record.trace["clearance_splats"] == pytest.approx(expected, abs=1e-6)
+
+
 @pytest.mark.parametrize("is_continuous", [True, False])
 def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_continuous: bool) -> None:
     """A tenth of a second in which the hand sweeps through a lost edge that neither state is near."""
     model, q, turn = simulated_arm(), np.array([0.0, -0.2, 0.0, -2.2, 0.0, 2.1, 0.785]), 0.3 * np.eye(7)[0]
     edge = model.sphere_centers(q)[-1]
-    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
-    fields = KnownFields(
-        barrier=Away(),
-        distances={"exact": away, "barrier": away},
-        median_radius=0.01,
-        obstacles=lambda points: (nothing,) * len(points),
-    )
+    fields = fields_of(away, Away())
     seen = Seen(
         look=look_free,
         edges=np.array([[*edge, 1e-3]]),
@@ -141,13 +187,7 @@ def test_what_spheres_leave_uncovered_is_not_taken_from_a_surface_that_is_measur
     center = model.sphere_centers(q[0])[-1] + [0.0, 0.0, -0.3]
     ball = SphereField(Spheres.of(center[None], np.array([0.01])))
     scene = BallDistance(of_points=lambda points: ball.query(points)[0], centers=center[None], radii=np.array([0.01]))
-    nothing = Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan))
-    fields = KnownFields(
-        barrier=ball,
-        distances={"exact": scene, "barrier": scene},
-        median_radius=0.01,
-        obstacles=lambda points: (nothing,) * len(points),
-    )
+    fields = fields_of(scene, ball)
     known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
     record.measure_block(np.array([0]), q, np.zeros((1, 7)))
@@ -166,12 +206,7 @@ def test_a_thing_that_the_hand_holds_for_a_time_counts_while_it_is_held() -> Non
     base = arm.join_self_model(held_part(link, np.asarray(ball.triangles), *ALWAYS))
     model = base.join_self_model(held_part(link, ball.triangles + place[:3], SECOND // 4, 55 * SECOND // 100))
     scene = BallDistance(of_points=away, centers=(hand - [0.0, 0.0, 0.3])[None], radii=np.array([0.01]))
-    fields = KnownFields(
-        barrier=Away(),
-        distances={"exact": scene, "barrier": scene},
-        median_radius=0.01,
-        obstacles=lambda points: (Obstacle(distance=1.0, position=(np.nan, np.nan, np.nan)),) * len(points),
-    )
+    fields = fields_of(scene, Away())
     known = KnownScene(at=lambda _: fields, observed=None, first_ns=None, cameras=None, digests={})
     stamps = np.arange(8) * SECOND // 10
     record = ReplayRecord(model, known, config=Config(), max_map_age=1.0)
