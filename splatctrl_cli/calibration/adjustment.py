@@ -52,14 +52,13 @@ Widths = tuple[float, float]
 
 @dataclass(kw_only=True)
 class Normal:
-    """Normal equations H (P, P), g (P,); scores (C, P): g by cluster.
+    """Normal equations H (P, P), g (P,).
 
     counts: residuals that count, by pair; spread: their robust standard deviation [sigma].
     """
 
     H: Float64
     g: Float64
-    scores: Float64
     counts: Mapping[tuple[str, str], int]
     spread: float
 
@@ -111,42 +110,43 @@ class Adjustment:
         return 1 / np.square(sigma), offset
 
     def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
-        P, (reach, cut) = self.unknowns.size, widths
-        H, g = np.zeros((P, P)), np.zeros(P)
-        scores: list[Float64] = []
-        numbers: dict[tuple[str, int], int] = {}
+        H, g = np.zeros((self.unknowns.size, self.unknowns.size)), np.zeros(self.unknowns.size)
         counts: dict[tuple[str, str], int] = {}
-        deviations: list[Float64] = []
-        for rows in self.rows(estimate, reach, with_robot=with_robot):
-            if not len(rows.residual):
-                continue
-            deviation = np.abs(rows.residual) / rows.sigma
-            width = np.minimum(reach / rows.sigma, cut)
-            weight = np.where(deviation < width, np.square(1 - np.square(deviation / width)), 0.0)
-            is_free = rows.columns >= 0
-            columns, J = rows.columns[is_free], rows.jacobian[:, is_free] / rows.sigma[:, None]
+        deviations = [np.zeros(0)]
+        for rows, J, weight in self._weighed(estimate, widths, with_robot=with_robot):
             weighed = J * weight[:, None]
-            part = np.einsum("k,kp->kp", rows.residual / rows.sigma, weighed)
-            np.add.at(H, np.ix_(columns, columns), weighed.T @ J)
-            np.add.at(g, columns, part.sum(axis=0))
-            cells, of_cell = np.unique(rows.clusters, return_inverse=True)
-            sums = np.zeros((len(cells), len(columns)))
-            np.add.at(sums, of_cell, part)
-            for cell, own in zip(cells.tolist(), sums, strict=True):
-                number = numbers.setdefault((rows.alike, cell), len(scores))
-                if number == len(scores):
-                    scores.append(np.zeros(P))
-                np.add.at(scores[number], columns, own)
+            H += weighed.T @ J
+            g += (rows.residual / rows.sigma) @ weighed
             counts[rows.between] = counts.get(rows.between, 0) + int((weight > 0).sum())
-            deviations.append(deviation)
-        every = np.concatenate(deviations) if deviations else np.zeros(0)
-        return Normal(
-            H=H,
-            g=g,
-            scores=np.array(scores).reshape(-1, P),
-            counts=counts,
-            spread=1.4826 * float(np.median(every)) if len(every) else 0.0,
-        )
+            deviations.append(np.abs(rows.residual) / rows.sigma)
+        every = np.concatenate(deviations)
+        return Normal(H=H, g=g, counts=counts, spread=1.4826 * float(np.median(every)) if len(every) else 0.0)
+
+    def scores(self, estimate: Estimate, widths: Widths) -> Float64:
+        """Gradient (G, P) of each cluster of residuals with correlated errors."""
+        sums: dict[tuple[str, int], Float64] = {}
+        for rows, J, weight in self._weighed(estimate, widths, with_robot=True):
+            cells, of_cell = np.unique(rows.clusters, return_inverse=True)
+            own = np.zeros((len(cells), self.unknowns.size))
+            np.add.at(own, of_cell, (rows.residual / rows.sigma * weight)[:, None] * J)
+            for cell, score in zip(cells.tolist(), own, strict=True):
+                sums[rows.alike, cell] = sums.get((rows.alike, cell), 0.0) + score
+        return np.array([*sums.values()]).reshape(-1, self.unknowns.size)
+
+    def _weighed(
+        self, estimate: Estimate, widths: Widths, *, with_robot: bool
+    ) -> Iterator[tuple[Rows, Float64, Float64]]:
+        """Yield rows with residuals, their jacobian (M, P) by all unknowns [sigma], and weights (M,)."""
+        reach, cut = widths
+        for rows in self.rows(estimate, reach, with_robot=with_robot):
+            if len(rows.residual):
+                deviation, width = np.abs(rows.residual) / rows.sigma, np.minimum(reach / rows.sigma, cut)
+                weight = np.where(deviation < width, np.square(1 - np.square(deviation / width)), 0.0)
+                yield rows, (rows.jacobian / rows.sigma[:, None]) @ self._is_column(rows.columns), weight
+
+    def _is_column(self, columns: Index) -> Float64:
+        """1 where an entry of columns (17,), if free, is an unknown's: (17, P)."""
+        return np.asarray(columns[:, None] == np.arange(self.unknowns.size), np.float64)
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
         """Misfit, and the number of points that can be compared.

@@ -63,9 +63,9 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
     points projected anew, where that cancels. Raises NotEvaluableError where no view measures a surface that another
     view or the robot has.
     """
-    whole = adjustment.normal(estimate, widths)
+    whole, scores = adjustment.normal(estimate, widths), adjustment.scores(estimate, widths)
     refuse_if(
-        not len(whole.scores),
+        not len(scores),
         "calibrate: the cameras measure no surface in common, and none of the robot's",
         remedy="record a scene or a robot that they see at a finer resolution, or begin nearer (--camera-pose)",
         error=NotEvaluableError,
@@ -74,8 +74,8 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
     reach = _reach(adjustment, estimate)
     back = np.linalg.inv(reach)
     H, H_robot = back.T @ whole.H @ back, back.T @ (whole.H - between.H) @ back
-    num = len(whole.scores)
-    scores = whole.scores @ back * np.sqrt(num / max(num - len(H), 1))
+    num = len(scores)
+    scores = scores @ back * np.sqrt(num / max(num - len(H), 1))
     M = scores.T @ scores
     floor = 1e-9 * float(np.trace(H)) / len(H)
     first = np.linalg.inv(H + floor * np.eye(len(H)))

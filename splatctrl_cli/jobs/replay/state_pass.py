@@ -185,7 +185,8 @@ class ReplayRecord:
     ) -> Float64:
         """Clearances `each` (T, M) [m], lowered linearly in time to the next map's.
 
-        So objects come nearer evenly. Maps known late, or over `UNWATCHED_NS` apart, change nothing. pick: the distance of a map.
+        So objects come nearer evenly. Maps known late, or over `UNWATCHED_NS` apart, change nothing. pick: the
+        distance of a map.
         """
         scene, now_ns = self._scene, int(stamps[0])
         first, next_ns = scene.depth_ns(now_ns), scene.next_ns(now_ns)
