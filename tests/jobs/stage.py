@@ -111,7 +111,8 @@ class Stage:
         last = self.map_stamps[-1]
         writer.finish(last, self._splats(last), self._voxels(last))
         metrics = {"cameras": ["cam0", "cam1", "cam2"], "has_clock": True, "stamp_ns": last, **self.metrics}
-        write_json(folder / "run.json", {"metrics": metrics, "parts": part_digests(folder)})
+        run = {"command": "reconstruct", "arguments": [], "metrics": metrics, "parts": part_digests(folder)}
+        write_json(folder / "run.json", run)
         return folder
 
     def bake(self) -> Path:
@@ -258,19 +259,16 @@ def run(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Runs:
     """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
 
     def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:
-        desk.source.states = passing()
-        near = ball_beside(arm, passing()[-1].position, 0.012, way=np.array([s.position for s in passing()[:-1]]))
-        stage = Stage(desk=desk, arm=arm, balls=(FAR,), later=(near,), later_from=500_000_000)
-        scene = desk.folder / "scene"
-        if not scene.exists():
+        stage = Stage(desk=desk, arm=arm, later=[Beside(0.012)])
+        desk.source.states = stage.states
+        if not (desk.folder / "scene").exists():
             stage.scene()
-            patch_json(scene / "run.json", lambda found: found | {"command": "reconstruct", "arguments": []})
         words = ["--scene", "scene", "--urdf", desk.robot[1], "--spheres", desk.robot[3]]
         monkeypatch.setattr(sys, "argv", ["splatctrl", "replay", "fake.mcap", *words, "--mode", mode])
         monkeypatch.chdir(desk.folder)
         desk.replay(*words[:2], "--mode", mode, "-q", *more, out=out)
-        cv2.imwrite(str(desk.folder / out / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
         folder = desk.folder / out
+        cv2.imwrite(str(folder / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
         patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
         return folder
 

@@ -74,8 +74,7 @@ def test_a_scene_opens_at_its_first_camera_and_has_a_menu_of_all(stage: Stage, t
         }
         for name, eye in eyes.items()
     ]
-    metrics = {"cameras": [*eyes], "has_clock": True, "stamp_ns": 0, "first_frames": frames}
-    scene = replace(stage, run={"command": "reconstruct", "arguments": [], "metrics": metrics}).scene()
+    scene = replace(stage, metrics={"cameras": [*eyes], "stamp_ns": 0, "first_frames": frames}).scene()
     side = space_of(scene).cameras[1]
     assert (side["name"], side["eye"], side["fov"]) == ("side", eyes["side"], pytest.approx(90.0))
     np.testing.assert_allclose(side["ahead"], np.array([0.0, -1.0, -0.2]) / np.hypot(1.0, 0.2))
