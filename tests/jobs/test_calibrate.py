@@ -136,8 +136,7 @@ def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
         if name == biased:
             assert abs(camera.bias - 0.01) < 2 * camera.sigma_depth[1] < 0.005
         else:
-            assert camera.bias == 0.0
-            assert "depth bias" in camera.as_recorded
+            assert camera.bias == 0.0 and "depth bias" in camera.as_recorded
             assert camera.depth_noticed[1] < 0.01
         assert camera.scale == 1.0
     rows = [row for row in errors("", setup, found) if row.unknown in ("position", "rotation")]
@@ -146,8 +145,7 @@ def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
 
 def test_the_bias_that_would_not_be_noticed_is_said(setup: SetUp, result: CalibrateResult) -> None:
     for name, camera in result.calibration.cameras.items():
-        assert camera.bias == 0.0
-        assert 0.002 <= camera.depth_noticed[1] < 0.01
+        assert camera.bias == 0.0 and 0.002 <= camera.depth_noticed[1] < 0.01
         assert (camera.scale != 1.0) == (name == "cam0")
         assert camera.depth_noticed[0] < abs(setup.scale - 1)
 
@@ -183,8 +181,7 @@ def test_a_camera_on_the_wrist_is_put_right_on_its_mount(wrist: SetUp, wrist_res
     found = wrist_result.calibration.cameras[WRIST]
     assert found.moves
     twist = twist_between(np.linalg.inv(wrist.off[WRIST]), found.T)
-    assert np.linalg.norm(twist[3:]) < 0.002
-    assert np.linalg.norm(twist[:3]) < np.radians(0.2)
+    assert np.linalg.norm(twist[3:]) < 0.002 and np.linalg.norm(twist[:3]) < np.radians(0.2)
     assert largest(wrist, wrist_result, "clock") < 0.003
     distance, angle = wrist_result.moved[WRIST]
     assert distance == pytest.approx(0.02, abs=0.002)
@@ -262,8 +259,7 @@ class Still(SetUp):
 
 def test_a_robot_that_hardly_moves_is_refused(tmp_path: Path, plain_arm: Path) -> None:
     told = refused(Still(2, SMALL), tmp_path, **robot_in(plain_arm))
-    assert "the robot hardly moves" in told
-    assert "record it moving" in told
+    assert "the robot hardly moves" in told and "record it moving" in told
 
 
 def test_one_camera_without_a_robot_has_nothing_to_be_placed_against(tmp_path: Path) -> None:
@@ -292,13 +288,10 @@ class Bare(SetUp):
 
 def test_directions_that_a_table_does_not_show_are_named(tmp_path: Path) -> None:
     told = refused(Bare(2, SMALL), tmp_path)
-    assert "not observed: " in told
-    assert "of cam1" in told
-    assert "translation in the table's plane" in told
+    assert "not observed: " in told and "of cam1" in told and "translation in the table's plane" in told
     assert "put objects of different shapes" in told
 
 
 def test_a_robot_that_meshes_draw_needs_no_spheres(sample_data: Path) -> None:
     model = pose_robot((), sample_data / "tabletop" / "robot.urdf", RobotOptions())
-    assert model.surface.trees
-    assert not len(model.sphere_set.radii)
+    assert model.surface.trees and not len(model.sphere_set.radii)

@@ -135,8 +135,7 @@ def test_settings_versions_and_inputs_that_differ_are_named(audit: Path, tmp_pat
 
     result = compared(audit, changed(audit, tmp_path / "new", edit))
     assert set(result.differences) == {"control.margin", "numpy", "input robot.urdf"}
-    assert result.differences["control.margin"] == ("0.02", "0.03")
-    assert result.verdict.exit_code == 0
+    assert (result.differences["control.margin"], result.verdict.exit_code) == (("0.02", "0.03"), 0)
 
 
 def test_nothing_on_both_sides_is_not_evaluable(audit: Path, tmp_path: Path) -> None:
@@ -353,8 +352,7 @@ def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() 
 def test_a_margin_that_was_taken_away_is_found_with_the_state_where_it_shows(run: Runs) -> None:
     before, after = run("before", "closed-loop"), run("after", "closed-loop", "--set", "control.margin=0.002")
     result = compared(before, after)
-    assert result.verdict.exit_code == 1
-    assert result.differences["control.margin"] == ("0.02", "0.002")
+    assert (result.verdict.exit_code, result.differences["control.margin"]) == (1, ("0.02", "0.002"))
     worst = next(one for one in result.figures if one.metric == "min_clearance")
     assert worst.change is Change.WORSE and worst.where is not None and "ball" not in worst.where.sphere
     with (after / "steps.csv").open() as stream:

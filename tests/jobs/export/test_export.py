@@ -34,13 +34,11 @@ def export(scene: Path, name: str, **options: Any) -> Result:
 def test_scene_is_exported_and_renders_the_same(scene: Path) -> None:
     result = export(scene, "out.ply")
     assert export(scene, "again.ply").out.read_bytes() == result.out.read_bytes()
-    assert result.metrics["largest_pixel_difference"] <= 3 / 255
-    assert result.metrics["covered_share"] > 0.1
+    assert result.metrics["largest_pixel_difference"] <= 3 / 255 and result.metrics["covered_share"] > 0.1
     assert result.metrics["num_splats"] == 400
     splats, comments = read_ply(scene.parent / "out.ply")
     assert len(splats) == 400
-    assert comments["scene"] == "ball"
-    assert comments["exported_from"].startswith("splats.ply sha256 ")
+    assert comments["scene"] == "ball" and comments["exported_from"].startswith("splats.ply sha256 ")
 
 
 @pytest.mark.parametrize(("place", "given"), [("elsewhere", "../scene"), ("scene", "."), ("scene/below", "..")])
@@ -177,9 +175,7 @@ def test_json_has_what_was_written_and_how_it_looks(scene: Path, capsys: pytest.
     out = scene.parent / "out.ply"
     assert run_export(scene, "-o", out, "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["file"] == str(out)
-    assert result["bytes"] == out.stat().st_size
-    assert result["num_views_compared"] == 4
+    assert (result["file"], result["bytes"], result["num_views_compared"]) == (str(out), out.stat().st_size, 4)
     assert result["largest_pixel_difference"] <= 3 / 255
 
 

@@ -75,8 +75,7 @@ def test_the_splats_of_each_time_are_clouds(run: Runs, tmp_path: Path) -> None:
     for stamp, cloud in clouds:
         splats = open_scene(tmp_path / "scene").splats_at(stamp)
         values = unpacked(cloud, NUMBERS)
-        assert cloud.frame_id == "world"
-        assert cloud.timestamp.ToNanoseconds() == stamp
+        assert (cloud.frame_id, cloud.timestamp.ToNanoseconds()) == ("world", stamp)
         np.testing.assert_array_equal(np.column_stack([values[axis] for axis in "xyz"]), splats.centers)
         np.testing.assert_array_equal(values["radius"], splats.radii)
         np.testing.assert_array_equal(values["label"], splats.labels)

@@ -297,8 +297,7 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
 
 def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
-    near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    return {column: near, f"{column}_place": np.full((NUM, 3), 0.25)}
+    return {column: np.where(np.arange(NUM) == 4, distance, np.inf), f"{column}_place": np.full((NUM, 3), 0.25)}
 
 
 @pytest.mark.parametrize(
@@ -315,8 +314,7 @@ def from_a_surface(column: str, distance: float) -> dict[str, Any]:
 def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
     near: Callable[[float], dict[str, Any]], distance: float, count: int
 ) -> None:
-    run = judged(near(distance))
-    found = [r for r in evidence.known_space(run) if r.outcome is NOT_EVALUABLE]
+    found = [r for r in evidence.known_space(judged(near(distance))) if r.outcome is NOT_EVALUABLE]
     told = [(r.count, r.time_s, r.place) for r in found if f"{1e3 * distance:.1f} mm" in r.sentence]
     assert told == [(1, pytest.approx(0.4), (0.25, 0.25, 0.25))] * count and len(found) == count
 

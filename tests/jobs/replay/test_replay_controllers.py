@@ -101,8 +101,7 @@ def test_the_commands_of_the_log_are_judged_as_a_controllers(
     _, verdict = stage.judged(*run, mode=mode)
     assert ", controller recorded" in verdict["scope"]
     for row in stage.desk.rows()[:40]:
-        newest = min(int(float(row["time_s"]) * 10 + 1e-6), 10)
-        assert float(row["v_joint1"]) == pytest.approx(commands[newest][0])
+        assert float(row["v_joint1"]) == pytest.approx(commands[min(int(float(row["time_s"]) * 10 + 1e-6), 10)][0])
     stage.states = passing()
     assert stage.judged(*run, mode=mode, scene=stage.desk.folder / "scene")[0] == 4
     assert "the log has no commanded velocities; name their columns" in capsys.readouterr().err

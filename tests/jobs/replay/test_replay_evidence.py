@@ -213,8 +213,7 @@ def test_a_rounded_truth_is_of_the_recording(stage: Stage) -> None:
 
 @pytest.mark.parametrize(("away_s", "is_other"), [(0.9, False), (1.1, True)])
 def test_times_of_scene_and_states_may_be_a_second_apart(stage: Stage, away_s: float, is_other: bool) -> None:
-    last = stage.map_stamps[-1]
-    stage.states = states_on(np.tile(START, (3, 1)), start_ns=int(last + away_s * SECOND))
+    stage.states = states_on(np.tile(START, (3, 1)), start_ns=int(stage.map_stamps[-1] + away_s * SECOND))
     _, verdict = stage.judged("--max-map-age", "10")
     assert decisive(verdict).get("evidence") == ("not evaluable" if is_other else None)
     assert not is_other or "are of different times" in str(verdict["reasons"])

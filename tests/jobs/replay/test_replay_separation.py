@@ -105,8 +105,7 @@ def test_a_replay_without_the_option_has_no_separation(stage: Stage) -> None:
 def test_people_are_those_with_a_label_and_the_rest_is_static(stage: Stage) -> None:
     near, far = (ball_beside(stage.arm, START, gap) for gap in (0.1, 0.4))
     stage.states, stage.balls, stage.people = resting(), [near], [far]
-    labelled = CELL.replace('"newcomer"\nempty_at = 0.0', '"labelled"')
-    assert stage.judged(*separation_option(stage, labelled))[0] == 0
+    assert stage.judged(*separation_option(stage, CELL.replace('"newcomer"\nempty_at = 0.0', '"labelled"')))[0] == 0
     assert column(stage, "separation").min() > 0.35
     assert column(stage, "stop_clearance") == pytest.approx(np.full(11, 0.1), abs=1e-3)
     scene = stage.desk.folder / "scene"
@@ -170,8 +169,7 @@ def test_a_baked_field_and_a_single_map_are_refused(stage: Stage, capsys: pytest
 def test_a_driven_arm_is_judged_by_its_commands(stage: Stage) -> None:
     stage.balls = [FAR, ball_beside(stage.arm, START, 0.5)]
     stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")), mode="closed-loop")
-    rows = stage.desk.rows()
-    speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in rows])
+    speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in stage.desk.rows()])
     assert np.any(speed) and np.all((column(stage, "S_s") > 0) == np.any(speed != 0, axis=1))
 
 

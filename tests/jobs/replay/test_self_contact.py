@@ -132,8 +132,7 @@ def test_a_lowered_margin_hides_no_contact_of_the_driven_arm(
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED)
     found = judged(desk, *DRIVE)
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")]
-    assert len(said) == 1
-    assert "block and drum" in said[0]
+    assert len(said) == 1 and "block and drum" in said[0]
     if spheres is COVERING:  # its row stops the arm before the block, and the goal in it is not reached
         assert (found["outcome"], desk.metrics()["goal_reached"]) == ("passed", 0)
         assert "(their surfaces then" in said[0]
@@ -241,8 +240,7 @@ def measured(model: RobotModel, urdf: Path, packages: Path) -> MeasuredRobot:
 def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONFIG) -> ReplayTrace:
     """The arm is driven over the last 3 s of the log."""
     motion, frame = tabletop.arm_motion(7.0), model.frame_names[-1]
-    goal = model.frame_pose(motion.at(7.0)[0], frame)
-    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=goal, frame=frame)
+    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=model.frame_pose(motion.at(7.0)[0], frame), frame=frame)
     return closed_loop(model, config, task, lambda _: field)
 
 
@@ -268,8 +266,7 @@ def test_what_the_pairs_of_an_fr3_keep_keeps_their_surfaces_apart(fr3: MeasuredR
     kept = {pair.links: pair for pair in fr3.pair_margins}
     assert set(kept) == {("fr3_link5", "fr3_link7"), ("fr3_link5", "fr3_hand")}
     for pair in kept.values():
-        assert -0.015 < pair.margin < 0.02
-        assert pair.surface_gap > 0.01
+        assert -0.015 < pair.margin < 0.02 and pair.surface_gap > 0.01
 
 
 # joint6 and joint7 [rad], the sphere gap at least or at most, and whether link5 and link7 touch
@@ -287,8 +284,7 @@ def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredR
     assert sphere_gap(panda.model, q, "link5", "link7") > 0.015
     assert nearest(panda, q) < 0
     (kept,) = panda.pair_margins
-    assert kept.links == ("panda_link5", "panda_link7")
-    assert kept.surface_gap < 0
+    assert kept.links == ("panda_link5", "panda_link7") and kept.surface_gap < 0
 
 
 def nearest(robot: MeasuredRobot, q: Float64) -> float:

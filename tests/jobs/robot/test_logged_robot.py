@@ -99,8 +99,7 @@ def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str)
         message = as_parameter(robot()) if kind == "parameter" else described(robot(), topic)
         path = log_with(tmp_path / "run.mcap", message)
     assert logged_urdf([path]).text == robot()
-    request = ReplayRequest(log=path, out=tmp_path / "out")
-    assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
+    assert open_log(ReplayRequest(log=path, out=tmp_path / "out"))[0].joint_names == ("joint_a", "joint_b")
 
 
 def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given(tmp_path: Path) -> None:

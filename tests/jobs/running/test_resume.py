@@ -95,8 +95,7 @@ def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
         patch.setattr(scene_writer, "savez", failing(scene_writer.savez, 2, KeyboardInterrupt()))
         assert main(given) == 130
     assert main([*given, "--resume"]) == 0
-    document = json.loads((tmp_path / "scene" / "run.json").read_text())
-    assert document["config"]["scene"]["max_splats"] == 800
+    assert json.loads((tmp_path / "scene" / "run.json").read_text())["config"]["scene"]["max_splats"] == 800
     assert main([*command(recording, "log", tmp_path / "whole"), "--max-splats", "200"]) == 0
     assert contents(tmp_path / "scene") == contents(tmp_path / "whole")
 
@@ -111,8 +110,7 @@ def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
         assert main(given) == 6
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert "000003.ply: writing failed: No space left" in err
-    assert "--resume" in err
+    assert "000003.ply: writing failed: No space left" in err and "--resume" in err
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole["log"]
 
@@ -123,8 +121,7 @@ def test_a_file_size_limit_is_a_full_disk_too(recording: Path, tmp_path: Path) -
     limited += "from splatctrl_cli.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = [sys.executable, "-B", "-c", limited, *command(recording, "log", tmp_path / "scene")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 6
-    assert done.stderr.count("\n") == 1
+    assert (done.returncode, done.stderr.count("\n")) == (6, 1)
     assert "writing failed: File too large" in done.stderr
     assert not list(tmp_path.iterdir())  # no checkpoint was whole
 
@@ -289,8 +286,7 @@ def test_a_wait_is_announced_and_says_how_long_it_still_is(
     for seconds in steps:
         now[0] += seconds
         wait.step()
-    assert len(said.lines) == num_lines
-    assert said.lines[0] == f"fits views: {num} iterations"
+    assert (len(said.lines), said.lines[0]) == (num_lines, f"fits views: {num} iterations")
     assert said.lines[1:2] + said.lines[-1:] == [f"fits views: {words}" for words in (first, last)] or not first
 
 
@@ -322,7 +318,6 @@ def warnings_in(path: Path) -> list[tuple[str, str]]:
 
 
 def test_every_warning_has_a_remedy() -> None:
-    rooms = Path(splatctrl_cli.__file__).parent
-    found = [text for path in sorted(rooms.rglob("*.py")) for text in warnings_in(path)]
+    found = [text for path in sorted(Path(splatctrl_cli.__file__).parent.rglob("*.py")) for text in warnings_in(path)]
     assert len(found) > 6
     assert [text for text in found if ";" not in text[1] and not text[1].endswith("{}")] == []

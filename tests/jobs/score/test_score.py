@@ -62,8 +62,7 @@ def run(folder: Path, cameras: tuple[str, ...] | None = None, **changes: Any) ->
 
 def test_views_are_rendered_from_the_newest_snapshot_early_ones_counted_and_seen_pixels_told(scored: Path) -> None:
     result = run(scored)
-    assert result.document["cameras"] == ["cam3"]
-    assert result.document["skipped_views"] == ["cam3-0000"]
+    assert (result.document["cameras"], result.document["skipped_views"]) == (["cam3"], ["cam3-0000"])
     dark, right, away = result.document["views"]
     assert (dark["view"], right["view"], away["view"]) == ("cam3-0001", "cam3-0002", "cam3-0003")
     assert dark["psnr_all"] == pytest.approx(20.0, abs=0.6), "0.4 instead of 0.5"
@@ -72,8 +71,7 @@ def test_views_are_rendered_from_the_newest_snapshot_early_ones_counted_and_seen
     assert (result.metrics["num_views"], result.metrics["num_skipped"]) == (3, 1)
     assert (result.verdict.counts["psnr_all"], result.verdict.counts["psnr_seen"], result.notes) == (2, 2, ())
     assert right["seen_share"] == pytest.approx(58 / 64, abs=0.03), "the view is moved by 0.1 m, 6 pixels"
-    assert away["seen_share"] == 0.0
-    assert away["psnr_seen"] is None
+    assert away["seen_share"] == 0.0 and away["psnr_seen"] is None
     assert away["depth_median_all"] is None
 
 
@@ -87,9 +85,7 @@ def test_without_a_clock_every_view_is_scored_from_the_final_splats(
 ) -> None:
     set_up(monkeypatch, FakeScene(has_clock=False, snapshots=()), FakeSource(frames=FRAMES, has_clock=False))
     report = run(scored).document
-    assert report["snapshots"] == "final"
-    assert report["metrics"]["num_skipped"] == 0
-    assert len(report["views"]) == 4
+    assert (report["snapshots"], report["metrics"]["num_skipped"], len(report["views"])) == ("final", 0, 4)
 
 
 @pytest.mark.parametrize("label", [None, Label.ROBOT])
@@ -116,8 +112,7 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     report = json.loads((result.out / "score.json").read_text())
     assert report == result.document
     assert [row["view"] for row in rows] == [view["view"] for view in report["views"]]
-    assert float(rows[0]["psnr_all"]) == report["views"][0]["psnr_all"]
-    assert rows[2]["psnr_seen"] == ""
+    assert (float(rows[0]["psnr_all"]), rows[2]["psnr_seen"]) == (report["views"][0]["psnr_all"], "")
     run_json = json.loads((result.out / "run.json").read_text())
     assert run_json["metrics"] == report["metrics"]
     assert compare(CompareRequest(runs=(result.out, result.out))).metrics["num_figures"] > 5
@@ -127,8 +122,7 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path) -> None:
     result = run(scored, require=("psnr_all>=1",))
     assert result.document["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"
-    assert result.verdict.exit_code == 5
-    assert "psnr_all is unknown" in result.verdict.sentence
+    assert result.verdict.exit_code == 5 and "psnr_all is unknown" in result.verdict.sentence
 
 
 def test_a_training_camera_is_scored_only_when_allowed(scored: Path) -> None:
@@ -169,8 +163,7 @@ def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: p
     (view,) = report["views"]
     assert (view["view"], view["camera"], report["training_cameras"]) == ("holdout-0001", "holdout", ["camera"])
     assert view["psnr_seen"] == pytest.approx(20.0, abs=0.6)
-    assert view["depth_median_seen"] < 1e-5
-    assert view["seen_share"] > 0.8
+    assert view["depth_median_seen"] < 1e-5 and view["seen_share"] > 0.8
     whole = RecordingRequest(path=scored / "dtu", is_dtu=True)
     with pytest.raises(
         UsageError, match=r"each camera has the name of one that trained the scene \(camera\); give the"
@@ -311,8 +304,7 @@ def test_stretched_gaussians_with_harmonics_are_scored_as_they_are(one_view: Pat
     render = render_gaussians(gaussians, INTRINSICS, SIDE, threads=1).color
     assert result.metrics["psnr_all"] == pytest.approx(psnr(np.clip(render, 0, 1), frame.color / 255.0), abs=0.01)
     assert (one_view / "out" / "score.json").is_file()
-    assert "does not say which views trained it" in result.notes[0]
-    assert result.metrics["psnr_seen"] is None
+    assert "does not say which views trained it" in result.notes[0] and result.metrics["psnr_seen"] is None
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat", ".spz"])

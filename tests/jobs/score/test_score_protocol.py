@@ -79,8 +79,7 @@ def test_a_scan_scores_the_same_through_both_layouts(place: Path) -> None:
 
 def test_without_depth_colours_are_scored_and_nothing_counts_as_seen(place: Path) -> None:
     metrics = scored(place, "blind").metrics
-    assert metrics["psnr_seen"] is None
-    assert metrics["depth_median_all"] is None
+    assert metrics["psnr_seen"] is None and metrics["depth_median_all"] is None
     with_depth = scored(place, "idr").metrics
     for name in ("psnr_masked", "psnr_all", "ssim_published"):
         assert metrics[name] == pytest.approx(with_depth[name], abs=1e-9)
@@ -230,13 +229,11 @@ def test_the_surface_is_compared_with_a_cloud_in_millimetres(
     result = scored(place, "mvsnet", cloud=settings, require=gates)
     metrics = figures(result)
     assert result.verdict.exit_code == 0
-    assert 0.0005 < metrics["accuracy"] < 0.012
-    assert 0.0005 < metrics["completeness"] < 0.012
+    assert 0.0005 < metrics["accuracy"] < 0.012 and 0.0005 < metrics["completeness"] < 0.012
     assert metrics["chamfer"] == pytest.approx((metrics["accuracy"] + metrics["completeness"]) / 2)
     assert metrics["completeness_seen_beyond"] < metrics["completeness_beyond"] + 1e-9
     out = "\n".join(lines_of(result.document))
-    assert "surface: accuracy " in out
-    assert "1 unit = 0.001 m; points 4 mm apart; means below 20 mm" in out
+    assert "surface: accuracy " in out and "1 unit = 0.001 m; points 4 mm apart; means below 20 mm" in out
     blind = figures(scored(place, "blind", cloud=settings))
     assert blind["accuracy"] == pytest.approx(metrics["accuracy"], rel=1e-3), "the surface is rendered, not recorded"
     near = figures(scored(place, "mvsnet", cloud=replace(settings, max_distance=0.004)))
@@ -267,8 +264,7 @@ def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
 
 
 def test_the_surface_is_compared_with_a_mesh(place: Path, views: list[DtuView], tmp_path: Path) -> None:
-    middle = np.median(surface(views), axis=0)
-    corners = middle + 0.1 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    corners = np.median(surface(views), axis=0) + 0.1 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     mesh = tmp_path / "plane.obj"
     mesh.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 1 3 4\n", encoding="ascii")
     metrics = figures(scored(place, "mvsnet", cloud=CloudSettings(path=mesh, spacing=0.005, max_distance=0.1)))

@@ -85,8 +85,7 @@ def test_the_folder_holds_the_arm_with_its_meshes_and_covering_spheres(simulated
     model = RobotModel.from_urdf(simulated / "robot.urdf", simulated / "robot_spheres.yaml")
     assert coverage_deficit(urdf, model.sphere_set).max_deficit == 0.0
     truth = load_truth(simulated / "truth.json")
-    assert truth.joint_names == tuple(f"my_joint{k}" for k in range(1, 8))
-    assert truth.clearance.min() > 0.02
+    assert truth.joint_names == tuple(f"my_joint{k}" for k in range(1, 8)) and truth.clearance.min() > 0.02
 
 
 def test_every_depth_of_the_log_lies_on_the_arm_or_in_the_scene(simulated: Path) -> None:
