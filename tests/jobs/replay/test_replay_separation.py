@@ -13,6 +13,7 @@ from tests.cli.replay_desk import SECOND, START
 from tests.jobs.stage import FAR, MOVE, QUARTER, Stage, ball_beside, passing, resting, unseen_about
 from tests.reference import separation as reference
 
+NEWCOMER = 'who = "newcomer"\nempty_at = 0.0'
 CELL = """
 [person]
 who = "newcomer"
@@ -109,7 +110,7 @@ def test_people_are_those_with_a_label_and_the_rest_is_static(stage: Stage) -> N
     assert column(stage, "separation").min() > 0.35
     assert column(stage, "stop_clearance") == pytest.approx(np.full(11, 0.1), abs=1e-3)
     scene = stage.desk.folder / "scene"
-    anything = CELL.replace('who = "newcomer"\nempty_at = 0.0', 'unseen = "ignored"')
+    anything = CELL.replace(NEWCOMER, 'unseen = "ignored"')
     stage.judged(*separation_option(stage, anything), scene=scene)
     assert column(stage, "separation") == pytest.approx(np.full(11, 0.1), abs=1e-3)
 
@@ -168,7 +169,7 @@ def test_a_baked_field_and_a_single_map_are_refused(stage: Stage, capsys: pytest
 
 def test_a_driven_arm_is_judged_by_its_commands(stage: Stage) -> None:
     stage.balls = [FAR, ball_beside(stage.arm, START, 0.5)]
-    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")), mode="closed-loop")
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, "")), mode="closed-loop")
     speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in stage.desk.rows()])
     assert np.any(speed) and np.all((column(stage, "S_s") > 0) == np.any(speed != 0, axis=1))
 
@@ -179,7 +180,7 @@ def test_a_fast_hand_before_a_person_counts_more_than_a_slow_link_that_is_nearer
     behind = arm.sphere_centers(q)[slow] - np.array([arm.sphere_set.radii[slow] + 0.05 + 0.15, 0.0, 0.0])
     ahead = ball_beside(arm, START + 1.3 * MOVE, 0.05)
     stage.states, stage.balls = moving_on(), [FAR, ((behind[0], behind[1], behind[2]), 0.05), ahead]
-    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")))
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, "")))
     apart = column(stage, "separation") - column(stage, "clearance_exact")
     parts = [(row["separation_part"], row["nearest_exact"]) for row in stage.desk.rows()]
     assert apart.max() > 0.01 and any(worst != nearest for worst, nearest in parts)
