@@ -356,8 +356,15 @@ def test_what_is_not_observed_stays_as_recorded_and_the_rest_is_found(tmp_path: 
 
 def test_a_robot_of_which_one_link_is_seen_does_not_say_all(tmp_path: Path, plain_arm: Path) -> None:
     options = SourceOptions(cameras=("cam0",))
-    with pytest.raises(NotEvaluableError, match=r"not observed: translation along . of the world of cam0"):
-        calibrated(OneLink(2), tmp_path, options=options, **robot_in(plain_arm))
+    expect_refusal(
+        r"not observed: translation along . of the world of cam0",
+        calibrated,
+        OneLink(2),
+        tmp_path,
+        options=options,
+        error=NotEvaluableError,
+        **robot_in(plain_arm),
+    )
 
 
 def test_a_link_of_which_too_few_pixels_are_seen_ties_no_camera(
@@ -365,8 +372,15 @@ def test_a_link_of_which_too_few_pixels_are_seen_ties_no_camera(
 ) -> None:
     monkeypatch.setattr(f"{__name__}.SMALL", replace(SMALL, width=120, height=90))
     options = SourceOptions(cameras=("cam0",))
-    with pytest.raises(NotEvaluableError, match="measure no surface in common, and none of the robot's"):
-        calibrated(OneLink(2), tmp_path, options=options, **robot_in(plain_arm))
+    expect_refusal(
+        "measure no surface in common, and none of the robot's",
+        calibrated,
+        OneLink(2),
+        tmp_path,
+        options=options,
+        error=NotEvaluableError,
+        **robot_in(plain_arm),
+    )
 
 
 def test_a_camera_that_sees_neither_what_the_others_see_nor_the_robot_is_named(

@@ -134,8 +134,15 @@ def test_what_was_baked_otherwise_is_not_gone_on_with(
     splats: Path, tmp_path: Path, more: dict[str, Any], words: str
 ) -> None:
     interrupted(splats, tmp_path / "field", 3)
-    with pytest.raises(UsageError, match=f"{re.escape(words)}.*bake without --resume"):
-        bake(splats, tmp_path / "field", resume=True, **more)
+    expect_refusal(
+        f"{re.escape(words)}.*bake without --resume",
+        bake,
+        splats,
+        tmp_path / "field",
+        resume=True,
+        error=UsageError,
+        **more,
+    )
     assert (tmp_path / "field.partial" / "channels" / "sdf.npy").is_file()
 
 
@@ -186,7 +193,13 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
     grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
     monkeypatch.setattr(grid_cells, "available_memory", lambda: 27 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz"])
-    with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
-        bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
+    expect_refusal(
+        r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats",
+        bake_slabs.check_vdb,
+        grid,
+        ["sdf"],
+        ["npz", "vdb"],
+        error=UsageError,
+    )
     monkeypatch.setattr(grid_cells, "available_memory", lambda: 28 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])

@@ -27,6 +27,7 @@ from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked, field_json
 from tests.jobs.stage import interrupt, patch_json
 from tests.plain import known, plain_grid
+from tests.refused import expect_refusal
 
 BOX = (-0.6, -0.6, -0.5, 0.6, 0.6, 0.5)
 SECOND = 10**9
@@ -102,8 +103,9 @@ def test_a_bare_file_needs_its_predecessor(tmp_path: Path) -> None:
     for path, splats, field in ((old, before(), "first"), (new, after(before()), "whole")):
         write_ply(path, splats, {})
         bake(path, tmp_path / field, box=BOX)
-    with pytest.raises(UsageError, match="was not baked from the splats of"):
-        bake(new, tmp_path / "field", update=tmp_path / "first")
+    expect_refusal(
+        "was not baked from the splats of", bake, new, tmp_path / "field", update=tmp_path / "first", error=UsageError
+    )
     bake(new, tmp_path / "field", update=tmp_path / "first", previous_scene=old)
     assert npz(tmp_path / "field") == npz(tmp_path / "whole")
 
@@ -133,8 +135,15 @@ def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(scene: Path,
 def test_what_was_baked_otherwise_is_not_updated(
     scene: Path, fields: Path, tmp_path: Path, more: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(UsageError, match=f"{re.escape(words)}.*bake without --update"):
-        bake(scene, tmp_path / "field", update=fields / "0", **more)
+    expect_refusal(
+        f"{re.escape(words)}.*bake without --update",
+        bake,
+        scene,
+        tmp_path / "field",
+        update=fields / "0",
+        error=UsageError,
+        **more,
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -211,8 +220,15 @@ def test_held_out_depth_agrees_with_splats_on_the_true_surface(
 def test_depth_later_than_the_scene_does_not_count(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", (1, read_ply(true_splats)[0]))
     log = sample_data / "tabletop" / "log.mcap"
-    with pytest.raises(NotEvaluableError, match="no frame of cam3 up to the time of the scene"):
-        bake_true(scene, tmp_path / "field", held_out=log, held_out_cameras=("cam3",))
+    expect_refusal(
+        "no frame of cam3 up to the time of the scene",
+        bake_true,
+        scene,
+        tmp_path / "field",
+        held_out=log,
+        held_out_cameras=("cam3",),
+        error=NotEvaluableError,
+    )
 
 
 def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
@@ -260,10 +276,16 @@ def spheres(num: int = 5, seed: int = 0) -> SplatSet:
 
 
 def test_an_empty_set_is_refused(tmp_path: Path) -> None:
-    with pytest.raises((InputError, NotEvaluableError)):
-        bake_splats(spheres().select(np.zeros(5, bool)), tmp_path)
-    with pytest.raises(NotEvaluableError, match="none of 5 is labelled object, human; give a scene that has some"):
-        bake_splats(replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)), tmp_path)
+    expect_refusal(
+        "", bake_splats, spheres().select(np.zeros(5, bool)), tmp_path, error=(InputError, NotEvaluableError)
+    )
+    expect_refusal(
+        "none of 5 is labelled object, human; give a scene that has some",
+        bake_splats,
+        replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)),
+        tmp_path,
+        error=NotEvaluableError,
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["splats.ply"]
 
 

@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareRe
 from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 from tests.jobs.stage import Runs
+from tests.refused import expect_refusal
 
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
 NEAR |= {"place": [1.0, 2.0, 3.0], "cause": "near splat 7", "remedy": "stop"}
@@ -291,8 +292,7 @@ def test_a_shard_of_a_batch_is_compared_and_the_others_are_named(
 
 
 def refused(words: str, *runs: Path, kind: type[SplatCtrlError] = InputError, **more: Path) -> None:
-    with pytest.raises(kind, match=words):
-        compared(*runs, **more)
+    expect_refusal(words, compared, *runs, error=kind, **more)
 
 
 def test_what_cannot_be_compared_is_refused_by_name(audit: Path, tmp_path: Path) -> None:

@@ -120,8 +120,13 @@ def test_a_field_with_its_scene_has_the_distance_of_the_grid_and_the_rest_of_the
         assert [row[name] for row in both] == [row[name] for row in of_scene]
     assert (both[4]["probability"], result.document["source"]) == ("", "field and scene")
     other = write_scene(tmp_path / "other", (START_NS, splats_of(BALLS[0])))
-    with pytest.raises(UsageError, match=r"field: was not baked from the splats of .*other; .* as --scene"):
-        query_points(field, scene=other)
+    expect_refusal(
+        r"field: was not baked from the splats of .*other; .* as --scene",
+        query_points,
+        field,
+        scene=other,
+        error=UsageError,
+    )
 
 
 def test_blocks_change_no_answer(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

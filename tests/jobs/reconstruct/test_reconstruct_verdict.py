@@ -176,8 +176,13 @@ def test_a_gate_on_a_figure_that_is_not_there_is_not_evaluable_by_name(value: fl
 
 
 def test_a_gate_on_an_unknown_figure_names_the_nearest() -> None:
-    with pytest.raises(UsageError, match="did you mean unrepresented_voxels"):
-        reconstruct_verdict(made(*STEPS), ["unrepresented_voxel<=0"])
+    expect_refusal(
+        "did you mean unrepresented_voxels",
+        reconstruct_verdict,
+        made(*STEPS),
+        ["unrepresented_voxel<=0"],
+        error=UsageError,
+    )
 
 
 def test_a_gate_on_points_inside_a_robot_that_no_pixel_showed_is_not_evaluable() -> None:

@@ -147,8 +147,12 @@ def test_a_replay_in_real_time_names_what_it_dropped(replayed: Replays) -> None:
     known = [stamp + round(1e9 * delay) for stamp, delay in zip(stamps, metrics["map_delays_s"], strict=True)]
     used = [max(0.0, 1e-9 * (each - states.stamps_ns[0])) for each in known if each <= states.stamps_ns[-1]]
     assert since == used[-len(since) :]
-    with pytest.raises(UsageError, match="--real-time: expected --lockstep"):
-        check_lockstep(ReplayRequest(log=Path(), scene=Path(), real_time=True))
+    expect_refusal(
+        "--real-time: expected --lockstep",
+        check_lockstep,
+        ReplayRequest(log=Path(), scene=Path(), real_time=True),
+        error=UsageError,
+    )
 
 
 def test_the_log_is_read_four_times(
@@ -182,8 +186,12 @@ def test_the_fit_of_a_lockstep_computes_where_it_is_told_to(
     opened(small_recording, tmp_path, arm, latency=0.0, device="cuda").finish()
     assert [each["device"] for each in run_of(tmp_path / "scene")["metrics"]["devices"]] == ["cuda:0"]
     assert not memory.sizes  # given back
-    with pytest.raises(UsageError, match="--device cuda: expected --lockstep"):
-        check_lockstep(ReplayRequest(log=small_recording, out=tmp_path, scene=tmp_path, device="cuda"))
+    expect_refusal(
+        "--device cuda: expected --lockstep",
+        check_lockstep,
+        ReplayRequest(log=small_recording, out=tmp_path, scene=tmp_path, device="cuda"),
+        error=UsageError,
+    )
 
 
 @pytest.mark.parametrize(

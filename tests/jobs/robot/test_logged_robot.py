@@ -160,8 +160,9 @@ def test_a_log_without_one_readable_robot_is_refused(
     tmp_path: Path, messages: tuple[RawMessage, ...], words: str
 ) -> None:
     path = log_with(tmp_path / "run.mcap", *messages)
-    with pytest.raises((InputError, UsageError), match=f"run.mcap.*{words}"):
-        open_log(ReplayRequest(log=path, out=tmp_path / "out"))
+    expect_refusal(
+        f"run.mcap.*{words}", open_log, ReplayRequest(log=path, out=tmp_path / "out"), error=(InputError, UsageError)
+    )
     if "broken" in words:
         assert "its robot_description cannot be read" in differs(read_urdf(written(tmp_path, robot())), [path])
 
@@ -223,8 +224,12 @@ def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path)
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
     assert _robot(request, Said()).sphere_set.links == ("tip",)
     other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
-    with pytest.raises(InputError, match=r"give --world-frame base, or --base with its pose"):
-        _robot(replace(request, source=open_source(other), recording=other), Said())
+    expect_refusal(
+        r"give --world-frame base, or --base with its pose",
+        _robot,
+        replace(request, source=open_source(other), recording=other),
+        Said(),
+    )
 
 
 def test_a_replay_says_where_it_places_the_robot_of_the_log(tmp_path: Path) -> None:

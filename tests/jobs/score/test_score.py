@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
@@ -98,8 +98,13 @@ def test_a_scene_without_a_splat_that_counts_is_not_evaluable_and_leaves_nothing
     else:
         splats.labels[:] = label
     monkeypatch.setattr(FakeScene, "splats", lambda scene: splats)
-    with pytest.raises(NotEvaluableError, match=f"none of {len(splats)} is labelled object, human; give a scene"):
-        run(scored, out=scored / "out")
+    expect_refusal(
+        f"none of {len(splats)} is labelled object, human; give a scene",
+        run,
+        scored,
+        out=scored / "out",
+        error=NotEvaluableError,
+    )
     assert [path.name for path in scored.iterdir()] == ["scene"]
 
 
@@ -165,10 +170,12 @@ def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: p
     assert view["psnr_seen"] == pytest.approx(20.0, abs=0.6)
     assert view["depth_median_seen"] < 1e-5 and view["seen_share"] > 0.8
     whole = RecordingRequest(path=scored / "dtu", is_dtu=True)
-    with pytest.raises(
-        UsageError, match=r"each camera has the name of one that trained the scene \(camera\); give the"
-    ):
-        score(ScoreRequest(scene=scored / "scene", recording=whole))
+    expect_refusal(
+        r"each camera has the name of one that trained the scene \(camera\); give the",
+        score,
+        ScoreRequest(scene=scored / "scene", recording=whole),
+        error=UsageError,
+    )
 
 
 def test_what_lies_in_free_space_is_scored(scored: Path) -> None:
@@ -240,10 +247,12 @@ def test_several_references_are_one_session(session: Path, capsys: pytest.Captur
 def test_the_other_log_alone_asks_for_the_one_that_trained(session: Path) -> None:
     whole = make_log(session / "whole.mcap", LogRecipe(cameras=("cam0", "cam1")))
     write_raw(session / "alone.mcap", filter(of("cam1", "tf"), messages_of(whole)))
-    with pytest.raises(
-        InputError, match=r"has no camera cam0; give that recording, .* give both, each as --reference"
-    ):
-        run_session(session, "alone.mcap")
+    expect_refusal(
+        r"has no camera cam0; give that recording, .* give both, each as --reference",
+        run_session,
+        session,
+        "alone.mcap",
+    )
 
 
 def test_a_camera_that_no_transform_joins_to_the_world_is_refused_by_name(session: Path) -> None:
@@ -263,8 +272,13 @@ def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
 
 
 def test_a_log_beside_an_image_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"views.toml: expected a log, as the others are, got a folder of images"):
-        RecordingRequest(path=tmp_path / "views.toml", others=(tmp_path / "b.mcap",))
+    expect_refusal(
+        r"views.toml: expected a log, as the others are, got a folder of images",
+        RecordingRequest,
+        path=tmp_path / "views.toml",
+        others=(tmp_path / "b.mcap",),
+        error=UsageError,
+    )
 
 
 STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)
@@ -337,5 +351,10 @@ def test_splats_in_another_unit_are_refused(one_view: Path) -> None:
 
 def test_a_surface_cannot_be_looked_at_without_training_views(one_view: Path) -> None:
     write_gaussian_ply(one_view / "other.ply", wall_with_harmonics(), {})
-    with pytest.raises(UsageError, match="--cloud: the surface is looked at from the views that trained, which"):
-        run_file(one_view / "other.ply", cloud=CloudSettings(path=one_view / "cloud.ply"))
+    expect_refusal(
+        "--cloud: the surface is looked at from the views that trained, which",
+        run_file,
+        one_view / "other.ply",
+        cloud=CloudSettings(path=one_view / "cloud.ply"),
+        error=UsageError,
+    )

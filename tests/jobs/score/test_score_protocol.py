@@ -12,7 +12,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.reconstruct import lines_of
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.held_out_depth import space_out
 from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.evaluate.verdict import JudgedResult
@@ -118,8 +118,14 @@ def test_a_scene_of_another_split_is_refused_with_the_views(place: Path) -> None
     words = "protocol dtu-train trains on 8 views (train 0-7; score 0-7), of which 2 did not train the scene"
     said = expect_refusal(words, scored, place, "mvsnet", "dtu-train", error=UsageError)
     assert "and 0 others did; reconstruct with --protocol dtu-train" in said
-    with pytest.raises(UsageError, match="of which 2 did not train the scene, and 2 others did"):
-        scored(place, "mvsnet", "holdout:2,6")
+    expect_refusal(
+        "of which 2 did not train the scene, and 2 others did",
+        scored,
+        place,
+        "mvsnet",
+        "holdout:2,6",
+        error=UsageError,
+    )
 
 
 def test_a_protocol_that_is_none_or_holds_out_twice_is_refused(place: Path) -> None:
@@ -173,10 +179,22 @@ def test_figures_are_compared_with_those_of_an_earlier_score(place: Path, tmp_pa
     assert result.verdict.sentence.endswith(" is -1.5, required >= -1")
     (change,) = [line.split() for line in lines_of(result.document) if line.startswith("change")]
     assert change[1:6] == ["-", "+0.00", "-1.50", "+0.0000", "+0.0000"]
-    with pytest.raises(UsageError, match="change_psnr_all>=-1: a figure of --baseline; give it"):
-        scored(place, "mvsnet", require=gates)
-    with pytest.raises(InputError, match="not comparable: mask_rule: expected object mask, got none; score the base"):
-        scored(place, "mvsnet", masks=place / "masks", baseline=path)
+    expect_refusal(
+        "change_psnr_all>=-1: a figure of --baseline; give it",
+        scored,
+        place,
+        "mvsnet",
+        require=gates,
+        error=UsageError,
+    )
+    expect_refusal(
+        "not comparable: mask_rule: expected object mask, got none; score the base",
+        scored,
+        place,
+        "mvsnet",
+        masks=place / "masks",
+        baseline=path,
+    )
     path.write_text("{}")
     expect_refusal(
         r"score\.json: expected the score\.json of an earlier score", scored, place, "mvsnet", baseline=path
@@ -186,8 +204,14 @@ def test_figures_are_compared_with_those_of_an_earlier_score(place: Path, tmp_pa
 def test_views_that_are_missing_are_named(place: Path, views: list[DtuView], tmp_path: Path) -> None:
     write_dtu(tmp_path / "dtu", "scan1", views)
     (tmp_path / "dtu/Depths_raw/scan1/depth_map_0004.pfm").unlink()
-    with pytest.raises(UsageError, match="of which 0 did not train the scene, and 1 others did"):
-        scored(place, tmp_path / "dtu", "holdout:every5")
+    expect_refusal(
+        "of which 0 did not train the scene, and 1 others did",
+        scored,
+        place,
+        tmp_path / "dtu",
+        "holdout:every5",
+        error=UsageError,
+    )
     expect_refusal("got no view 4; the scan has views 0-3, 5-7", scored, place, tmp_path / "dtu", "holdout:0,4")
     reference = DtuSource(tmp_path / "dtu", protocol=score_protocol("holdout:every5"))
     first, second = missing_views(reference, score_protocol("holdout:every5"))
@@ -257,10 +281,14 @@ def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
     above = space_out(points, 0.004)[:, 2] > 0.03
     assert metrics["num_reference"] == pytest.approx(np.count_nonzero(above), rel=0.05)
     assert "within the masks and above the planes of" in result.document["protocol"]["definitions"]["cloud"]
-    with pytest.raises(InputError):
-        scored(place, "mvsnet", cloud=CloudSettings(path=tmp_path / "masks.ply"))
-    with pytest.raises(InputError, match=r"ObsMask1_10\.mat: no such file; give the folder ObsMask"):
-        scored(place, "mvsnet", cloud=replace(settings, masks=place))
+    expect_refusal("", scored, place, "mvsnet", cloud=CloudSettings(path=tmp_path / "masks.ply"))
+    expect_refusal(
+        r"ObsMask1_10\.mat: no such file; give the folder ObsMask",
+        scored,
+        place,
+        "mvsnet",
+        cloud=replace(settings, masks=place),
+    )
 
 
 def test_the_surface_is_compared_with_a_mesh(place: Path, views: list[DtuView], tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
@@ -72,8 +72,11 @@ def arm(tmp_path_factory: pytest.TempPathFactory, plain_arm: Path) -> Path:
 def simulated(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("simulated") / "log"
     moved = shutil.copyfile(arm, tmp_path_factory.mktemp("elsewhere") / "arm.urdf")
-    with pytest.raises(InputError, match=r"package://my_arm/meshes/forearm\.stl was not found; .* --packages"):
-        simulate(SimulateRequest(out=out, urdf=moved, options=OPTIONS))
+    expect_refusal(
+        r"package://my_arm/meshes/forearm\.stl was not found; .* --packages",
+        simulate,
+        SimulateRequest(out=out, urdf=moved, options=OPTIONS),
+    )
     assert not out.exists()
     simulate(SimulateRequest(out=out, urdf=moved, packages=(arm.parents[1],), options=OPTIONS))
     return out

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.sweep.sweep import SweepRequest, SweepResult, sweep
@@ -158,8 +158,12 @@ def test_a_recording_that_changed_or_moved_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_that_has_other_settings_when_it_is_made_again_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"made again it has other settings: control\.period; its --config"):
-        swept(run_of(tmp_path, period=0.02), "margin=0.03:0.1")
+    expect_refusal(
+        r"made again it has other settings: control\.period; its --config",
+        swept,
+        run_of(tmp_path, period=0.02),
+        "margin=0.03:0.1",
+    )
 
 
 def test_a_sweep_with_other_settings_does_not_go_on_in_the_folder(tmp_path: Path) -> None:
@@ -180,5 +184,9 @@ def test_a_value_that_a_command_refuses_is_a_flip_of_its_own(tmp_path: Path) -> 
 
 
 def test_a_run_that_ends_for_another_reason_ends_the_sweep_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"latency=1: replay came to no verdict: not so; see .*\.log"):
-        swept(run_of(tmp_path, refuses=0.6, code=70), "latency=0:1")
+    expect_refusal(
+        r"latency=1: replay came to no verdict: not so; see .*\.log",
+        swept,
+        run_of(tmp_path, refuses=0.6, code=70),
+        "latency=0:1",
+    )
