@@ -115,8 +115,7 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
     request_: ReconstructRequest, sample_data: Path
 ) -> None:
     log = sample_data / "tabletop" / "log.mcap"
-    asked = ReplayRequest(log=log, out=request_.out, urdf=request_.urdf, spheres=request_.spheres)
-    bare, source = open_log(asked)
+    bare, source = open_log(ReplayRequest(log=log, out=request_.out, urdf=request_.urdf, spheres=request_.spheres))
     states = read_states(source, bare).states
     first_ns = int(states.stamp_ns[0])
     found = holding(bare)

@@ -93,8 +93,7 @@ def test_space_that_a_camera_saw_or_the_robot_was_in_is_known() -> None:
     shape = (3, 1, 1)
     seen, entity = np.reshape([4, 0, 0], shape), np.reshape([0, SWEPT, 0], shape)
     grid = plain_grid(shape, 0.1, 0.0, log_odds=0.0, num_updates=seen, entity=entity)
-    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])
-    assert known_space(grid)(points).tolist() == [1, 1, 0, 0]
+    assert known_space(grid)(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])).tolist() == [1, 1, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -133,8 +132,7 @@ def test_the_space_about_the_arm_is_asked_between_states_that_are_far_apart(is_c
     seen = Seen(look=look_free, edges=np.array([[*edge, 1e-3]]))
     fields = fields_of()
     record = recorded(model, scene_of(lambda _: fields, seen_at=lambda _: seen), is_continuous=is_continuous)
-    ways = np.array([POSTURE - turn, POSTURE + turn])
-    record.measure_block(np.array([0, SECOND // 10]), ways, np.zeros((2, 7)))
+    record.measure_block(np.array([0, SECOND // 10]), np.array([POSTURE - turn, POSTURE + turn]), np.zeros((2, 7)))
     first, second = record.trace["class_distance"][:, EvidenceClass.DEPTH_EDGE]
     assert first > 0.02 and ((second == 0.0) if is_continuous else (second > 0.02))
     place = record.trace["class_places"][1].reshape(-1, 3)[EvidenceClass.DEPTH_EDGE]

@@ -110,8 +110,7 @@ def test_people_are_those_with_a_label_and_the_rest_is_static(stage: Stage) -> N
     assert column(stage, "separation").min() > 0.35
     assert column(stage, "stop_clearance") == pytest.approx(np.full(11, 0.1), abs=1e-3)
     scene = stage.desk.folder / "scene"
-    anything = CELL.replace(NEWCOMER, 'unseen = "ignored"')
-    stage.judged(*separation_option(stage, anything), scene=scene)
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, 'unseen = "ignored"')), scene=scene)
     assert column(stage, "separation") == pytest.approx(np.full(11, 0.1), abs=1e-3)
 
 

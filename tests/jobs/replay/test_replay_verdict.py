@@ -402,8 +402,7 @@ def test_what_came_while_the_arm_was_driven_and_the_next_map_shows_is_a_hit(stag
     end_ns = int(stage.desk.rows()[-1]["stamp_ns"])
     stage.map_stamps = [*range(0, end_ns, QUARTER), end_ns + QUARTER // 10]
     stage.later, stage.later_from = [Beside(-0.02, START + MOVE)], end_ns
-    broken = {"scene hits": FAILED, "map age": NOT_EVALUABLE}
-    stage.expect(1, broken, mode="closed-loop", scene=stage.scene("later"))
+    stage.expect(1, {"scene hits": FAILED, "map age": NOT_EVALUABLE}, mode="closed-loop", scene=stage.scene("later"))
     stage.map_stamps = [*stage.map_stamps[:-1], end_ns + 10 * SECOND]
     assert stage.judged(mode="closed-loop", scene=stage.scene("much later"))[0] == 0
 

@@ -27,8 +27,7 @@ def run_of(folder: Path, outcome: str = "passed", words: tuple[str, ...] = (), *
     inputs = {name: sha256(folder / name) for name in ("log", "arm.urdf")}
     arguments += [*words, "-o", str(folder / "audit")]
     config = config_of(period=told.get("period", 0.01))
-    document = document_of(outcome, arguments=arguments, inputs=inputs, config=config)
-    write_json(folder / "audit" / "run.json", document)
+    write_json(folder / "audit" / "run.json", document_of(outcome, arguments=arguments, inputs=inputs, config=config))
     return folder / "audit"
 
 
@@ -56,8 +55,7 @@ def test_a_sweep_twice_runs_nothing_and_writes_the_same_bytes(tmp_path: Path) ->
     swept(run, "margin=0.02:0.1")
     file = tmp_path / "sweep" / "sweep.json"
     before, runs = file.read_bytes(), told(run)
-    again = swept(run, "margin=0.02:0.1")
-    assert (file.read_bytes(), told(run), again.num_new) == (before, runs, 0)
+    assert (file.read_bytes(), told(run), swept(run, "margin=0.02:0.1").num_new) == (before, runs, 0)
     swept(run, "margin=0.02:0.1", out="other", workers=2)
     assert (tmp_path / "other" / "sweep.json").read_bytes() == before
 
@@ -110,8 +108,7 @@ def test_a_latency_is_told_at_its_first_flip_with_what_comes_behind_it(
 
 
 def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
-    run = run_of(tmp_path, slope={"latency": 1.25, "margin": 12.5})
-    result = swept(run, "latency=0:1", "margin=0:0.1")
+    result = swept(run_of(tmp_path, slope={"latency": 1.25, "margin": 12.5}), "latency=0:1", "margin=0:0.1")
     alone = [flip.first.values for flip in result.flips if flip.first is not None]
     assert alone[0]["latency"] == pytest.approx(0.8, abs=0.02) and alone[1]["margin"] == pytest.approx(
         0.08, abs=0.002
