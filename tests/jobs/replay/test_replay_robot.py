@@ -173,10 +173,9 @@ def test_an_fr3_is_reminded_of_its_limits_by_position(plain_arm: Path, tmp_path:
     tabletop = plain_arm / "tabletop"
     text = (tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint')
     model = RobotModel.from_urdf(written(tmp_path, text, "fr3.urdf"), tabletop / "robot_spheres.yaml")
+    robot = MeasuredRobot(model=model, surfaces=None)
     doubts = [
-        doubts_of(
-            Namespace(mode=mode), MeasuredRobot(model=model, surfaces=None), ControlConfig(velocity_limits=limits)
-        )
+        doubts_of(Namespace(mode=mode), robot, ControlConfig(velocity_limits=limits))
         for mode, limits in (("closed-loop", "urdf"), ("closed-loop", "fr3"), ("audit", "urdf"))
     ]
     assert [len(each) for each in doubts] == [1, 0, 0] and "control.velocity_limits = fr3" in doubts[0][0]

@@ -23,6 +23,7 @@ from splatctrl_cli.jobs.running.progress import Wait, duration
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.jobs.bake.baked import Said
 from tests.jobs.stage import contents, failing
+from tests.robot.shapes import written
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
@@ -75,9 +76,8 @@ def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_writer, name, failing(getattr(scene_writer, name), when, KeyboardInterrupt()))
         assert main(given) == 130
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert ("scene.partial is kept" in err) == has_checkpoint
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("scene.partial is kept" in line) == has_checkpoint
     assert not (tmp_path / "scene").exists()
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole[kind]
@@ -108,9 +108,8 @@ def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_writer, "write_ply", failing(scene_writer.write_ply, 4, full))
         assert main(given) == 6
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "000003.ply: writing failed: No space left" in err and "--resume" in err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "000003.ply: writing failed: No space left" in line and "--resume" in line
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole["log"]
 
@@ -199,27 +198,22 @@ def test_a_run_goes_on_only_as_what_it_was(
     changed: list[str],
     said: str,
 ) -> None:
-    capsys.readouterr()
-    partial = tmp_path / "scene.partial"
+    partial, given = tmp_path / "scene.partial", list(interrupted)
     before = {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
-    given = list(interrupted)
     if changed == ["VERSION"]:
         monkeypatch.setattr("splatctrl_cli.jobs.running.device.__version__", "99")
-        changed = []
     elif changed == ["URDF"]:
-        other = tmp_path / "robot.urdf"
-        other.write_text((recording / "robot.urdf").read_text() + "\n")
-        given[given.index("--urdf") + 1] = str(other)
-        changed = []
+        given[given.index("--urdf") + 1] = str(written(tmp_path, (recording / "robot.urdf").read_text() + "\n"))
     elif changed == ["LOG"]:
         few = ["--duration", "0.6", "--width", "32", "--height", "24"]
         assert main(["simulate", "-o", str(tmp_path / "b"), *few]) == 0
-        given[1], changed = str(tmp_path / "b" / "log.mcap"), []
-        capsys.readouterr()
-    assert main([*given, *changed, "--resume"]) == 2
-    err = capsys.readouterr().err
-    assert said in err
-    assert err.count("\n") == 1
+        given[1] = str(tmp_path / "b" / "log.mcap")
+    else:
+        given += changed
+    capsys.readouterr()
+    assert main([*given, "--resume"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
     assert before == {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
 
 
@@ -263,9 +257,8 @@ def test_snapshots_are_taken_by_count_by_time_and_of_new_obstacles(
     given = [word for setting in settings for word in ("--set", setting)]
     assert main([*command(recording, "log", tmp_path / "scene"), "--cameras", "cam0", *given]) == 0
     scene = open_scene(tmp_path / "scene")
-    rows = [json.loads(line) for line in (tmp_path / "scene" / "audit.jsonl").read_text().splitlines()]
-    assert len(rows) == 6
-    assert [s.stamp_ns for s in scene.snapshots] == [rows[k]["stamp_ns"] for k in taken]
+    stamps = [json.loads(line)["stamp_ns"] for line in (scene.path / "audit.jsonl").read_text().splitlines()]
+    assert (len(stamps), [s.stamp_ns for s in scene.snapshots]) == (6, [stamps[k] for k in taken])
 
 
 @pytest.mark.parametrize(
