@@ -23,11 +23,11 @@ def run_of(folder: Path, outcome: str = "passed", words: tuple[str, ...] = (), *
         (folder / name).mkdir(parents=True)
     (folder / "log").write_text(json.dumps(told))
     (folder / "arm.urdf").write_text("<robot/>")
-    arguments = ["replay", str(folder / "log"), "--scene", str(folder / "scene"), "--urdf", str(folder / "arm.urdf")]
     inputs = {name: sha256(folder / name) for name in ("log", "arm.urdf")}
-    arguments += [*words, "-o", str(folder / "audit")]
-    config = config_of(period=told.get("period", 0.01))
-    write_json(folder / "audit" / "run.json", document_of(outcome, arguments=arguments, inputs=inputs, config=config))
+    options = ("--scene", folder / "scene", "--urdf", folder / "arm.urdf", *words, "-o", folder / "audit")
+    arguments, config = ["replay", folder / "log", *options], config_of(period=told.get("period", 0.01))
+    document = document_of(outcome, arguments=[*map(str, arguments)], inputs=inputs, config=config)
+    write_json(folder / "audit" / "run.json", document)
     return folder / "audit"
 
 
@@ -109,10 +109,8 @@ def test_a_latency_is_told_at_its_first_flip_with_what_comes_behind_it(
 
 def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
     result = swept(run_of(tmp_path, slope={"latency": 1.25, "margin": 12.5}), "latency=0:1", "margin=0:0.1")
-    alone = [flip.first.values for flip in result.flips if flip.first is not None]
-    assert alone[0]["latency"] == pytest.approx(0.8, abs=0.02) and alone[1]["margin"] == pytest.approx(
-        0.08, abs=0.002
-    )
+    alone = [flip.first.values[name] for flip, name in zip(result.flips, ("latency", "margin"), strict=True)]
+    assert alone == [pytest.approx(0.8, abs=0.02), pytest.approx(0.08, abs=0.002)]
     assert result.least.length == pytest.approx(0.8 / 2**0.5, abs=0.04)
     assert (result.least.last.outcome, result.least.first.outcome) == ("passed", "failed")
 
@@ -166,9 +164,8 @@ def test_a_run_that_has_other_settings_when_it_is_made_again_is_refused(tmp_path
 def test_a_sweep_with_other_settings_does_not_go_on_in_the_folder(tmp_path: Path) -> None:
     run = run_of(tmp_path)
     swept(run, "latency=0:0.5")
-    expect_refusal(
-        "begun with other settings: over, tolerance", swept, run, "latency=0:1", tolerance=0.1, error=UsageError
-    )
+    words = "begun with other settings: over, tolerance"
+    expect_refusal(words, swept, run, "latency=0:1", tolerance=0.1, error=UsageError)
     expect_refusal("is no sweep", swept, run, "latency=0:1", out="audit", error=UsageError)
 
 
