@@ -169,8 +169,8 @@ def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
 
 
 def test_only_surface_near_the_motion_and_in_the_judged_time_counts(desk: Desk, scene: list[str]) -> None:
-    frames = [*showing(MISSES), view(2 * SECOND, 0.5), view(-SECOND, 0.5)]
     elsewhere = FROM + np.array([4.0, 4.0, 0.0])
+    frames = [*showing(MISSES), view(2 * SECOND, 0.5), view(-SECOND, 0.5)]
     frames += [view(frame.stamp_ns, 1.0, eye=elsewhere, camera="cam8") for frame in frames]
     desk.source = FilmedSource(states=logged(), frames=frames, cameras=("cam0", "cam8", "cam9"))
     assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
