@@ -151,7 +151,19 @@ def cut(field: Path) -> None:
     (field / "field.npz").write_bytes((field / "field.npz").read_bytes()[:-2000])
 
 
-def of_another(field: Path, **changes: str) -> None:
+def replace_arrays(field: Path) -> None:
+    np.savez(field / "field.npz", a=np.zeros(3))
+
+
+def remove(field: Path) -> None:
+    (field / "field.npz").unlink()
+
+
+def break_run(field: Path) -> None:
+    (field / "run.json").write_text("{")
+
+
+def change_run(field: Path, **changes: str) -> None:
     patch_json(field / "run.json", lambda run: run | changes)
 
 
@@ -159,15 +171,11 @@ def of_another(field: Path, **changes: str) -> None:
     ("harm", "code", "words"),
     [
         (cut, 4, "field.npz: was changed after it was written"),
-        (
-            lambda field: np.savez(field / "field.npz", a=np.zeros(3)),
-            4,
-            "field.npz: was changed after it was written",
-        ),
-        (lambda field: (field / "field.npz").unlink(), 4, "field.npz: missing"),
-        (lambda field: (field / "run.json").write_text("{"), 4, "has no readable run.json"),
-        (partial(of_another, splatctrl="0.0.0"), 2, "got one of sdf-bake of 0.0.0"),
-        (partial(of_another, command="replay"), 2, "got one of replay of"),
+        (replace_arrays, 4, "field.npz: was changed after it was written"),
+        (remove, 4, "field.npz: missing"),
+        (break_run, 4, "has no readable run.json"),
+        (partial(change_run, splatctrl="0.0.0"), 2, "got one of sdf-bake of 0.0.0"),
+        (partial(change_run, command="replay"), 2, "got one of replay of"),
     ],
     ids=["cut", "foreign", "no npz", "no run", "other version", "other command"],
 )

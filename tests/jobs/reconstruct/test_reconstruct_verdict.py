@@ -71,8 +71,8 @@ def notes(reconstructed: Reconstructed) -> tuple[Reason, ...]:
 
 def test_a_sound_map_passes_without_a_note() -> None:
     verdict = reconstruct_verdict(made(*STEPS), [])
-    assert verdict.sentence == "reconstruct: PASSED (30 time steps of cam0, cam1, 100 splats)"
-    assert (verdict.shown, verdict.exit_code) == ((), 0)
+    sentence = "reconstruct: PASSED (30 time steps of cam0, cam1, 100 splats)"
+    assert (verdict.sentence, verdict.shown, verdict.exit_code) == (sentence, (), 0)
 
 
 OFF = {

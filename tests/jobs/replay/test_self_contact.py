@@ -68,9 +68,9 @@ def judged(desk: Desk, *arguments: str) -> dict[str, Any]:
     return next((reason for reason in desk.verdict()["reasons"] if reason["criterion"] == "self-clearance"), {})
 
 
-def conclusion(desk: Desk, *arguments: str) -> tuple[Any, ...]:
-    """Outcome, label and pair of the reason of self-clearance."""
-    return tuple(judged(desk, *arguments).get(name) for name in ("outcome", "label", "who"))
+def conclusion(found: dict[str, Any]) -> tuple[Any, ...]:
+    """Outcome, label and pair of a reason."""
+    return found["outcome"], found["label"], found["who"]
 
 
 @pytest.mark.parametrize("spheres", [COVERING, FAT, BLIND], ids=["covering", "fat", "blind"])
@@ -79,7 +79,7 @@ def test_an_arm_that_folds_into_itself_is_in_contact_whatever_its_spheres_are(
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED, CROSSED, OPEN)
     found = judged(desk)
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "contact", "block and drum")
+    assert conclusion(found) == ("failed", "contact", "block and drum")
     assert "block and drum overlap by 5.1 mm" in found["sentence"]
     assert desk.metrics()["min_self_clearance"] == pytest.approx(-0.0051, abs=1e-4)
     names = [e["worst_name"] for e in desk.json("events.json")["events"] if e["kind"] == "self-collision"]
@@ -128,16 +128,16 @@ def test_a_lowered_margin_hides_no_contact_of_the_driven_arm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], spheres: SphereSet
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED)
-    found = judged(desk, *DRIVE)
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")]
-    assert len(said) == 1 and "block and drum" in said[0]
+    found, goal_reached = judged(desk, *DRIVE), desk.metrics()["goal_reached"]
+    (said,) = (
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")
+    )
+    assert "block and drum" in said
     if spheres is COVERING:  # its row stops the arm before the block, and the goal in it is not reached
-        assert (found["outcome"], desk.metrics()["goal_reached"]) == ("passed", 0)
-        assert "(their surfaces then" in said[0]
+        assert (found["outcome"], goal_reached, "(their surfaces then" in said) == ("passed", 0, True)
     else:  # no row knows of the blade
-        assert (found["outcome"], found["label"]) == ("failed", "contact")
-        assert desk.metrics()["goal_reached"] == 1
-        assert "(their spheres do not tell when their surfaces meet)" in said[0]
+        assert (found["outcome"], found["label"], goal_reached) == ("failed", "contact", 1)
+        assert "(their spheres do not tell when their surfaces meet)" in said
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_links_apart_in_the_recording_that_a_lowered_margin_lets_come_together_a
     apart = desk_of(tmp_path, monkeypatch, spheres, OPEN, -OPEN, OPEN, urdf=urdf)
     found = judged(apart, *DRIVE, f"--goal-joints={goal}")
     assert (apart.metrics()["goal_reached"], apart.metrics()["num_relaxed"]) == (1, 0)
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
+    assert conclusion(found) == ("failed", "margin broken", "block and drum")
     assert 0 < found["value"] < found["threshold"] == pytest.approx(1e-3 * least, abs=1e-6)
     said = f"were driven to {1e3 * found['value']:.1f} mm apart, recorded {least} mm or more: spheres keep"
     assert said in found["sentence"]
@@ -167,7 +167,7 @@ def test_without_surfaces_spheres_that_a_lowered_margin_lets_come_together_are_n
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, COVERING, OPEN, -OPEN, OPEN, urdf=LOST)
     found = judged(desk, *DRIVE, "--goal-joints=0.5,1.9")
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
+    assert conclusion(found) == ("failed", "margin broken", "block and drum")
     assert desk.metrics()["num_relaxed"] == 0 and found["value"] < found["threshold"] - 0.001
 
 
@@ -180,7 +180,8 @@ def test_links_that_hardly_any_posture_parts_are_judged_where_the_recording_does
     said = "not judged whether they touch, for they overlap in every posture recorded or sampled: post and bob"
     assert said in capsys.readouterr().out
     desk = desk_of(tmp_path / "out", monkeypatch, POST_SPHERES, out, touching, urdf=POST)
-    assert conclusion(desk) == ("failed", "contact", "post and bob") and said not in capsys.readouterr().out
+    assert conclusion(judged(desk)) == ("failed", "contact", "post and bob")
+    assert said not in capsys.readouterr().out
 
 
 def test_without_geometry_spheres_that_overlap_are_a_contact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,18 +77,18 @@ class Bench:
     folder: Path
     capsys: pytest.CaptureFixture[str]
 
-    def main(self, code: int, *words: object) -> str:
-        """What a command says that ends with this code."""
+    def main(self, code: int, *words: object) -> Any:
+        """`out` and `err` of a command that ends with this code."""
         assert main([*map(str, words)]) == code
-        return "".join(self.capsys.readouterr())
+        return self.capsys.readouterr()
 
-    def reconstruct(self, name: str, *options: str, code: int = 0) -> str:
+    def reconstruct(self, name: str, *options: str, code: int = 0) -> Any:
         return self.main(code, "reconstruct", self.views, "-o", self.folder / name, *FAST, *options)
 
-    def bake(self, name: str, *options: object, code: int = 0) -> str:
+    def bake(self, name: str, *options: object, code: int = 0) -> Any:
         return self.main(code, "sdf-bake", self.splats, "-o", self.folder / name, *BAKE, *options)
 
-    def query(self, source: str | Path, *options: object, code: int = 0) -> str:
+    def query(self, source: str | Path, *options: object, code: int = 0) -> Any:
         return self.main(code, "query", self.folder / source, self.points, *options)
 
     def metrics(self, name: str) -> dict[str, Any]:
@@ -124,10 +124,10 @@ PROCESSOR = {"device": "cpu"}
 def test_a_reconstruction_on_a_card_is_that_of_the_processor_and_says_so(
     bench: Bench, on_card: EmulatedDevice
 ) -> None:
-    assert "computed on cuda:0 (Card, driver 580.1)" in bench.reconstruct("card", "--device", "cuda")
+    assert "computed on cuda:0 (Card, driver 580.1)" in bench.reconstruct("card", "--device", "cuda").out
     assert not on_card.sizes  # given back
     bench.reconstruct("again", "--device", "cuda:0", "-q")
-    assert "computed on cpu" in bench.reconstruct("cpu", "--device", "cpu")
+    assert "computed on cpu" in bench.reconstruct("cpu", "--device", "cpu").out
     assert bench.are_alike("card", "again") and not bench.are_alike("card", "cpu")
     mine, other = bench.metrics("card"), bench.metrics("cpu")
     known = [[{**device, "from_iteration": 0}] for device in (CARD, PROCESSOR)]
@@ -159,8 +159,8 @@ def test_a_run_that_one_device_began_goes_on_on_the_other(bench: Bench, begins: 
     known, names = {"cuda": CARD, "cpu": PROCESSOR}, {"cuda": "cuda:0 (Card, driver 580.1)", "cpu": "cpu"}
     began, went_on = ({**known[begins], "from_iteration": 0}, {**known[goes_on], "from_iteration": 6})
     assert (found["iterations"], found["devices"]) == (10, [began, went_on])
-    words = ("before iteration 6", "for the bytes of one of them", f"on {names[begins]}, then {names[goes_on]}")
-    assert all(each in said for each in words)
+    assert f"computed on {names[begins]}, then {names[goes_on]}" in said.out
+    assert "before iteration 6" in said.err and "for the bytes of one of them" in said.err
 
 
 @pytest.mark.usefixtures("on_card")
@@ -177,7 +177,7 @@ def test_a_card_that_is_lost_ends_the_run_by_name_and_it_goes_on_elsewhere(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cards(monkeypatch, Fails(15, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS")))
-    (line,) = bench.reconstruct("scene", "--device", "cuda", "-q", code=70).splitlines()
+    (line,) = bench.reconstruct("scene", "--device", "cuda", "-q", code=70).err.splitlines()
     assert f"{NAME}: CUDA_ERROR_ILLEGAL_ADDRESS; " in line
     assert f"{bench.folder}/scene.partial is kept: continue with --resume" in line
     assert not (bench.folder / "scene").exists()
@@ -191,7 +191,7 @@ def test_a_card_that_is_lost_at_once_leaves_nothing_and_no_silent_fallback(
     monkeypatch.setattr(device, "CARD_LEAST_WORK", 0)
     cards(monkeypatch, Fails(0, DeviceError("CUDA_ERROR_LAUNCH_FAILED")))
     said = bench.reconstruct("scene", "-q", code=70)
-    assert "CUDA_ERROR_LAUNCH_FAILED; start over, with --device cpu" in said
+    assert "CUDA_ERROR_LAUNCH_FAILED; start over, with --device cpu" in said.err
     assert not list(bench.folder.iterdir())
 
 
@@ -200,18 +200,18 @@ def test_too_little_memory_is_refused_with_the_budget_that_fits(
 ) -> None:
     cards(monkeypatch, EmulatedDevice(limit=2_000_000))
     said = bench.reconstruct("scene", "--device", "cuda", "--max-splats", "3000", "-q", code=2)
-    found = re.search(r"out of memory: 3000 splats.* a budget of (\d+) ", said)
+    found = re.search(r"out of memory: 3000 splats.* a budget of (\d+) ", said.err)
     bench.reconstruct("scene", "--device", "cuda", "--max-splats", found[1], "-q")
 
 
 def test_auto_takes_a_card_where_its_work_is_worth_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, on_card: EmulatedDevice
 ) -> None:
-    assert "computes on cpu: 400 splats on 4800 pixels are too little work" in bench.reconstruct("small")
+    assert "computes on cpu: 400 splats on 4800 pixels are too little work" in bench.reconstruct("small").err
     monkeypatch.setattr(device, "CARD_LEAST_WORK", 400 * 4800)
-    assert "computes on cuda:0 (Card, driver 580.1)" in bench.reconstruct("large")
+    assert "computes on cuda:0 (Card, driver 580.1)" in bench.reconstruct("large").err
     on_card.limit = 1_500_000
-    assert "computes on cpu: too little memory is free on the card" in bench.reconstruct("full")
+    assert "computes on cpu: too little memory is free on the card" in bench.reconstruct("full").err
     assert [bench.devices(name) for name in ("small", "large", "full")] == [["cpu"], ["cuda:0"], ["cpu"]]
 
 
@@ -236,7 +236,7 @@ def test_auto_goes_on_where_the_run_was(
     if not has_card:
         monkeypatch.setattr(device, "open_device", lack_card)
     said = bench.reconstruct("scene", "--resume")
-    assert (bench.devices("scene"), "computes on cpu: no NVIDIA driver" in said) == (ends, not has_card)
+    assert (bench.devices("scene"), "computes on cpu: no NVIDIA driver" in said.err) == (ends, not has_card)
 
 
 REFUSED = {
@@ -261,7 +261,7 @@ def test_a_card_that_cannot_be_used_is_refused_before_anything_is_read(
     if fake is not None:
         fake.install(monkeypatch)
         monkeypatch.setattr(driver, "LIBRARY", "libcuda.so.1")
-    (line,) = bench.reconstruct("out", "--device", "cuda", code=2).splitlines()
+    (line,) = bench.reconstruct("out", "--device", "cuda", code=2).err.splitlines()
     assert message in line and line.endswith("or give --device cpu")
     assert not list(bench.folder.iterdir())
 
@@ -299,18 +299,18 @@ def test_a_bake_on_a_card_is_that_of_the_processor_and_says_so(bench: Bench, on_
 
 @pytest.mark.usefixtures("on_card")
 def test_auto_bakes_on_a_card_where_its_work_is_worth_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "computes on" not in bench.bake("small")
+    assert "computes on" not in bench.bake("small").err
     monkeypatch.setattr(bake_request, "CARD_LEAST_BAKE", 4693 * bake_request.CARD_SPLATS)
-    assert f"computes on {NAME}" in bench.bake("large")
-    assert "computes on" not in bench.bake("updated", "--update", bench.folder / "small")
+    assert f"computes on {NAME}" in bench.bake("large").err
+    assert "computes on" not in bench.bake("updated", "--update", bench.folder / "small").err
     bench.bake("matern", "--distance", "gpdf")  # fewer splats
     assert bench.metrics("updated")["devices"] == bench.metrics("matern")["devices"] == [PROCESSOR]
 
 
 def test_a_card_that_cannot_be_used_is_refused_by_name(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LIBRARY", "libcuda_of_no_machine.so.1")
-    assert "--device cuda: " in bench.bake("field", "--device", "cuda", "-q", code=2)
-    assert "--device cuda:1: " in bench.query(bench.splats, "--device", "cuda:1", "-q", code=2)
+    assert "--device cuda: " in bench.bake("field", "--device", "cuda", "-q", code=2).err
+    assert "--device cuda:1: " in bench.query(bench.splats, "--device", "cuda:1", "-q", code=2).err
     assert not list(bench.folder.iterdir())
 
 
@@ -318,16 +318,16 @@ def test_a_card_that_cannot_be_used_is_refused_by_name(bench: Bench, monkeypatch
 def test_what_the_processor_alone_does_is_refused_on_a_card(bench: Bench) -> None:
     bench.bake("field", "-q")
     said = bench.bake("new", "--update", bench.folder / "field", "--device", "cuda", "-q", code=2)
-    assert "--update bakes on the processor" in said
+    assert "--update bakes on the processor" in said.err
     said = bench.query("field", "--device", "cuda", "-q", code=2)
-    assert "a baked field is read on the processor" in said
+    assert "a baked field is read on the processor" in said.err
 
 
 def test_a_card_that_is_lost_ends_the_bake_by_name_and_another_device_does_not_go_on(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cards(monkeypatch, Fails(0, DeviceError("CUDA_ERROR_ILLEGAL_ADDRESS")))
-    (line,) = bench.bake("field", "--device", "cuda", "-q", code=70).splitlines()
+    (line,) = bench.bake("field", "--device", "cuda", "-q", code=70).err.splitlines()
     assert f"{NAME}: CUDA_ERROR_ILLEGAL_ADDRESS; " in line
     assert not (bench.folder / "field").exists()
 
@@ -336,12 +336,13 @@ def test_a_card_that_is_lost_ends_the_bake_by_name_and_another_device_does_not_g
 def test_a_query_on_a_card_has_the_answers_of_the_processor(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = {}
     for name in ("cpu", "cuda", "auto"):
-        assert "computes on" not in bench.query(bench.splats, "-o", bench.folder / name, "--device", name)
+        assert "computes on" not in bench.query(bench.splats, "-o", bench.folder / name, "--device", name).err
         answers[name] = list(csv.DictReader((bench.folder / name).read_text().splitlines()))
     assert answers["auto"] == answers["cpu"]
+    names = ("distance", "bound", "surface_z")
     for mine, theirs in zip(answers["cuda"], answers["cpu"], strict=True):
-        figures = ([float(row[name]) for name in ("distance", "bound", "surface_z")] for row in (mine, theirs))
-        assert mine["splat"] == theirs["splat"] and next(figures) == pytest.approx(next(figures), abs=2e-4)
+        assert mine["splat"] == theirs["splat"]
+        assert [float(mine[n]) for n in names] == pytest.approx([float(theirs[n]) for n in names], abs=2e-4)
     monkeypatch.setattr(query, "CARD_LEAST_TABLE", 100)
-    assert f"computes on {NAME}" in bench.query(bench.splats, "-o", bench.folder / "large")
+    assert f"computes on {NAME}" in bench.query(bench.splats, "-o", bench.folder / "large").err
     assert (bench.folder / "large").read_bytes() == (bench.folder / "cuda").read_bytes()

@@ -145,9 +145,10 @@ def test_views_before_the_first_snapshot_or_that_no_training_camera_saw_cannot_b
 
 
 def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = (frame(0, "a", FRONT), frame(1, "b", SIDE, 0.1), frame(2, "c", FRONT))
-    names = ("color", "depth", "intrinsics", "T_world_camera")
-    views = [DtuView(name=f.camera, **{name: getattr(f, name) for name in names}) for f in shown]
+    views = [
+        DtuView(name=f.camera, color=f.color, depth=f.depth, intrinsics=f.intrinsics, T_world_camera=f.T_world_camera)
+        for f in (frame(0, "a", FRONT), frame(1, "b", SIDE, 0.1), frame(2, "c", FRONT))
+    ]
     write_dtu(scored / "dtu", "scan1", views)
     set_up(monkeypatch, FakeScene(cameras=("camera",), has_clock=False, snapshots=()), FakeSource(frames=[]))
     held_out = RecordingRequest(path=scored / "dtu", is_dtu=True, options=SourceOptions(holdout=("1",)))
