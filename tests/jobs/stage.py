@@ -11,12 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.files.output import part_digests, write_json
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.geometry import pose_at
-from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
+from splatctrl_cli.records import Box, Float64, JointState, Label, LossReport, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
@@ -66,6 +67,16 @@ def ball_beside(arm: RobotModel, q: Float64, gap: float, *, way: Float64 | None 
     raise AssertionError
 
 
+@dataclass(frozen=True)
+class Beside:
+    """A ball whose surface is `gap` [m] from the arm at q, by default at its last state and further off before."""
+
+    gap: float
+    q: Float64 | None = None
+    radius: float = 0.05
+    is_at_mount: bool = False  # behind the base instead, `gap` from its hindmost sphere, which no joint moves
+
+
 @dataclass(kw_only=True)
 class Stage:
     """What a replay is made of; by default of one that is safe: nothing is near, all is seen, four maps a second."""
@@ -73,19 +84,23 @@ class Stage:
     desk: Desk
     arm: RobotModel
     states: Sequence[JointState] = field(default_factory=passing)
-    balls: Sequence[Ball] = (FAR,)
-    later: Sequence[Ball] = ()
+    balls: Sequence[Ball | Beside] = (FAR,)
+    later: Sequence[Ball | Beside] = ()
     later_from: int = SECOND // 2  # [ns] from which these are there
     are_later_people: bool = False
-    people: Sequence[Ball] = ()
+    people: Sequence[Ball | Beside] = ()
+    true: Sequence[Ball | Beside] = ()  # what a truth has, where there is one
+    baked: dict[str, Any] | None = None  # settings of a field of the balls, by which the states are judged
     map_stamps: Sequence[int] = tuple(i * QUARTER for i in range(5))
     unrepresented: ArrayLike = ()
     last_seen: KnownVoxels | None = None  # instead of all that was seen at the time of each map
-    run: dict[str, Any] = field(default_factory=dict)  # of the scene's run.json, besides what it always has
-    spheres: Path | None = None
+    metrics: dict[str, Any] = field(default_factory=dict)  # of the scene's run.json, besides those of every scene
+    loss: LossReport = field(default_factory=LossReport)
+    smaller: dict[str, float] = field(default_factory=dict)  # by link, what its spheres lack of their radii [m]
 
     def scene(self, name: str = "scene") -> Path:
         """Its folder, written now."""
+        self.place()
         folder = self.desk.folder / name
         folder.mkdir()
         writer = SceneWriter(folder, {"frame": "world"})
@@ -95,33 +110,57 @@ class Stage:
             writer.snapshot(stamp_ns, self._splats(stamp_ns), voxels, states)
         last = self.map_stamps[-1]
         writer.finish(last, self._splats(last), self._voxels(last))
-        metrics = {"cameras": ["cam0", "cam1", "cam2"], "has_clock": True, "stamp_ns": last}
-        write_json(folder / "run.json", {"metrics": metrics, "parts": part_digests(folder)} | self.run)
+        metrics = {"cameras": ["cam0", "cam1", "cam2"], "has_clock": True, "stamp_ns": last, **self.metrics}
+        run = {"command": "reconstruct", "arguments": [], "metrics": metrics, "parts": part_digests(folder)}
+        write_json(folder / "run.json", run)
         return folder
+
+    def bake(self) -> Path:
+        """The folder of a field of the balls, written now."""
+        self.place()
+        box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
+        return write_field(self.desk.folder / "field", *self.balls, box=box, **{"voxel": 0.04} | (self.baked or {}))
+
+    def place(self) -> None:
+        """Balls beside the arm get their places."""
+        self.balls, self.later, self.people, self.true = (
+            [self.placed(ball) for ball in balls] for balls in (self.balls, self.later, self.people, self.true)
+        )
+
+    def placed(self, ball: Ball | Beside) -> Ball:
+        if not isinstance(ball, Beside):
+            return ball
+        if ball.is_at_mount:
+            return beside_the_mount(self.arm, ball.gap)
+        *way, end = (state.position for state in self.states)
+        at, before = (end, np.array(way)) if ball.q is None else (ball.q, None)
+        return ball_beside(self.arm, at, ball.gap, way=before, radius=ball.radius)
 
     def judged(self, *arguments: str, mode: str = "audit", scene: Path | None = None) -> tuple[int, dict[str, Any]]:
         """Exit code and verdict of the replay."""
-        self.desk.source.states = self.states
-        where = ("--scene", str(scene or self.scene()))
-        return self.replayed(*where, "--mode", mode, *arguments)
+        self.desk.source.states, self.desk.source.loss = self.states, self.loss
+        where = ("--scene", str(scene or self.scene())) if self.baked is None else ("--field", str(self.bake()))
+        true = ("--truth", str(self.truth(*self.true))) if self.true else ()
+        return self.replayed(*where, *true, "--mode", mode, *arguments)
+
+    def expect(
+        self, code: int, broken: dict[str, str], *arguments: str, says: str = "", label: str = "", **given: Any
+    ) -> dict[str, Any]:
+        """The verdict of a replay that ends with `code`, where the criteria in `broken` alone did not pass."""
+        found, verdict = self.judged(*arguments, **given)
+        assert (found, decisive(verdict)) == (code, broken), verdict["sentence"]
+        assert label in ("", verdict["label"]) and says in verdict["sentence"]
+        return verdict
 
     def replayed(self, *arguments: str) -> tuple[int, dict[str, Any]]:
         """Exit code and verdict of a replay against any scene; no verdict where it did not come to one."""
-        robot = self.desk.robot
-        if self.spheres is not None:
-            self.desk.robot = [*robot[:2], "--spheres", str(self.spheres)]
-        code = self.desk.replay(*arguments, "-q", "--force", is_judged=True)
-        self.desk.robot = robot
+        *robot, spheres = self.desk.robot
+        if self.smaller:
+            spheres = str(smaller_spheres(Path(spheres), self.desk.folder / "smaller.yaml", self.smaller))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(self.desk, "robot", [*robot, spheres])
+            code = self.desk.replay(*arguments, "-q", "--force", is_judged=True)
         return code, self.desk.verdict() if (self.desk.folder / "out").exists() else {}
-
-    def judged_by_field(
-        self, *balls: Ball, voxel: float = 0.04, moment_ns: int | None = None
-    ) -> tuple[int, dict[str, Any]]:
-        """Exit code and verdict of an audit of the states by a field of these balls that is of that time."""
-        self.desk.source.states = self.states
-        box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
-        folder = write_field(self.desk.folder / "field", *balls, box=box, moment_ns=moment_ns, voxel=voxel)
-        return self.replayed("--field", str(folder))
 
     def truth(self, *balls: Ball, name: str = "ball") -> Path:
         """A truth.json of these balls, called `name` and a number, beside the states."""
@@ -150,8 +189,7 @@ class Stage:
 
     def ball_at_the_end(self, gap: float, radius: float = 0.05) -> Ball:
         """A ball that the arm is `gap` [m] from at its last state, and further from before."""
-        *way, end = (state.position for state in self.states)
-        return ball_beside(self.arm, end, gap, way=np.array(way), radius=radius)
+        return self.placed(Beside(gap, radius=radius))
 
     def _splats(self, stamp_ns: int) -> SplatSet:
         later = self.later if stamp_ns >= self.later_from else ()
@@ -163,6 +201,24 @@ class Stage:
         if self.last_seen is not None:
             return self.last_seen
         return known(grid_seen(), stamp_ns, self.unrepresented)
+
+
+def beside_the_mount(arm: RobotModel, gap: float = -0.01) -> Ball:
+    """A ball behind the base, `gap` from its hindmost sphere, which no joint moves."""
+    x, y, z = arm.sphere_centers(START)[0]
+    assert not arm.moving_spheres[0]
+    return (float(x - arm.sphere_set.radii[0] - gap - 0.01), float(y), float(z)), 0.01
+
+
+def smaller_spheres(spheres: Path, path: Path, smaller: dict[str, float]) -> Path:
+    """The spheres of a file, less by link what is given [m]; those of which nothing is left are left out."""
+    document = yaml.safe_load(spheres.read_text())
+    for link, less in smaller.items():
+        of_link = document["collision_spheres"].pop(link)
+        if left := [one | {"radius": one["radius"] - less} for one in of_link if one["radius"] > less]:
+            document["collision_spheres"][link] = left
+    path.write_text(yaml.safe_dump(document))
+    return path
 
 
 def sphere(name: str, center: tuple[float, float, float], radius: float) -> Primitive:
@@ -203,19 +259,16 @@ def run(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Runs:
     """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
 
     def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:
-        desk.source.states = passing()
-        near = ball_beside(arm, passing()[-1].position, 0.012, way=np.array([s.position for s in passing()[:-1]]))
-        stage = Stage(desk=desk, arm=arm, balls=(FAR,), later=(near,), later_from=500_000_000)
-        scene = desk.folder / "scene"
-        if not scene.exists():
+        stage = Stage(desk=desk, arm=arm, later=[Beside(0.012)])
+        desk.source.states = stage.states
+        if not (desk.folder / "scene").exists():
             stage.scene()
-            patch_json(scene / "run.json", lambda found: found | {"command": "reconstruct", "arguments": []})
         words = ["--scene", "scene", "--urdf", desk.robot[1], "--spheres", desk.robot[3]]
         monkeypatch.setattr(sys, "argv", ["splatctrl", "replay", "fake.mcap", *words, "--mode", mode])
         monkeypatch.chdir(desk.folder)
         desk.replay(*words[:2], "--mode", mode, "-q", *more, out=out)
-        cv2.imwrite(str(desk.folder / out / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
         folder = desk.folder / out
+        cv2.imwrite(str(folder / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
         patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
         return folder
 

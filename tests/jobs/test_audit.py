@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,22 +35,24 @@ def test_one_call_leads_from_a_log_to_a_verdict_and_its_page(
     robot = ["--urdf", str(small_recording / "robot.urdf"), "--spheres", str(small_recording / "robot_spheres.yaml")]
     settings = [word for setting in QUICK for word in ("--set", setting)]
     log, out = str(small_recording / "log.mcap"), tmp_path / "out"
-    code = main(["audit", log, *robot, *settings, "-o", str(out)])
-    run = json.loads((out / "replay" / "run.json").read_text())
-    sentence = run["verdict"]["sentence"]
-    assert code == run["verdict"]["exit_code"] == 5
-    assert capsys.readouterr().out == f"{sentence}\n\npage: {out / 'report.html'}\n"
+    code, told = main(["audit", log, *robot, *settings, "-o", str(out)]), capsys.readouterr().out
+    run, page = json.loads((out / "replay" / "run.json").read_text()), (out / "report.html").read_text()
+    verdict, sentence = run["verdict"], run["verdict"]["sentence"]
+    assert (code, told) == (5, f"{sentence}\n\npage: {out / 'report.html'}\n")
+    assert verdict["exit_code"] == 5 and json.loads((out / "run.json").read_text())["verdict"] == verdict
     shared = [f"--set={setting}" for setting in QUICK]
     assert run["arguments"] == [
         *("replay", log, *robot, "-o", str(out / "replay"), *shared, "--scene", str(out / "scene"))
     ], "what makes the same again, and where a page finds scene and robot"
-    page = (out / "report.html").read_text()
-    said = sentence.split(" (")[0]
-    assert "<h1>audit of small/log.mcap</h1>" in page
-    assert page.index(said) < page.index("check: PASSED (log.mcap") < page.index("<h2>Logged motion</h2>")
+    said = (
+        "<h1>audit of small/log.mcap</h1>",
+        sentence.split(" (")[0],
+        "check: PASSED (log.mcap",
+        "<h2>Logged motion</h2>",
+    )
+    assert sorted(said, key=page.index) == [*said]
     assert 'id="data-replay"' in page and 'id="data-scene"' not in page, "the motion in 3-D"
     assert page.count('<figure class="pair">') == 4, "photo and render of each camera"
-    assert json.loads((out / "run.json").read_text())["verdict"] == run["verdict"]
     assert main(["compare", str(out), str(out)]) == 0
     compared = read_judged(out).runs
     assert [*compared] == ["replay", "scene"] and compared["replay"].metrics["min_clearance"] is not None
@@ -81,66 +83,58 @@ class Desk:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         self.num_runs += 1
-        reason = Reason(
-            criterion="clearance", outcome=self.outcomes.get(out.name, Outcome.PASSED), sentence="as told"
-        )
+        outcome = self.outcomes.get(out.name, Outcome.PASSED)
+        reason = Reason(criterion="clearance", outcome=outcome, sentence="as told")
         verdict = verdict_of(command, [reason], scope=out.name, passed="safe").as_dict()
-        write_run(
-            out,
-            command=command,
-            config={},
-            inputs={},
-            metrics={"num": self.num_runs},
-            stopwatch=Stopwatch(),
-            verdict=verdict,
-        )
+        made = {"command": command, "config": {}, "inputs": {}, "metrics": {"num": self.num_runs}, "verdict": verdict}
+        write_run(out, stopwatch=Stopwatch(), **made)
 
 
 @pytest.fixture
 def desk(small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
     urdf = tmp_path / "arm.urdf"
     urdf.write_text((small_recording / "robot.urdf").read_text())
-    spheres = small_recording / "robot_spheres.yaml"
-    log = small_recording / "log.mcap"
+    log, spheres = small_recording / "log.mcap", small_recording / "robot_spheres.yaml"
     desk = Desk(request=AuditRequest(log=log, urdf=urdf, spheres=spheres, out=tmp_path / "out"))
     checked = verdict_of("check", [Reason(outcome=Outcome.PASSED, sentence="")]).as_dict()
-    document = {"verdict": checked, "findings": []}
-    monkeypatch.setattr(module, "_check", lambda request: write_json(request.out / "check.json", document))
-    monkeypatch.setattr(module, "open_to_train", lambda *_: None)
-    monkeypatch.setattr(module, "open_scene", lambda *_: None)
-    monkeypatch.setattr(module, "render_newest", lambda *_: iter(()))
-    monkeypatch.setattr(module, "reconstruct", lambda request, _: desk.write(request, "reconstruct"))
-    monkeypatch.setattr(module, "replay", lambda request, _: desk.write(request, "replay"))
+    stand_ins: dict[str, Callable[..., Any]] = {
+        "_check": lambda request: write_json(request.out / "check.json", {"verdict": checked, "findings": []}),
+        "open_to_train": lambda *_: None,
+        "open_scene": lambda *_: None,
+        "render_newest": lambda *_: iter(()),
+        "reconstruct": lambda request, _: desk.write(request, "reconstruct"),
+        "replay": lambda request, _: desk.write(request, "replay"),
+    }
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(module, name, stand_in)
     return desk
 
 
 def test_a_second_call_makes_only_what_its_changes_decide(desk: Desk) -> None:
-    assert desk.steps_made() == ALL
-    assert desk.steps_made() == ()
-    assert desk.steps_made(threads=3) == ()
-    assert desk.steps_made(config=load_config(None, ["control.margin=0.03"])) == ("replay", "report")
-    assert desk.steps_made(config=load_config(None, ["scene.max_splats=900"])) == ("scene", "replay", "report")
-    assert desk.steps_made() == ("scene", "replay", "report"), "the folder holds one run of each"
-    assert desk.steps_made(goal_joints=(0.5,) * 7) == ("closed_loop", "report")
-    assert desk.steps_made(goal_joints=(0.4,) * 7) == ("closed_loop", "report")
-    assert desk.steps_made(seed=1) == ("scene", "replay", "report")
-    assert desk.steps_made(seed=1, base=BASE) == ALL
-    assert desk.steps_made(seed=1, base=BASE, locked={"joint1": 0.1}) == ALL
-    assert desk.steps_made(seed=1) == ALL
-    assert desk.steps_made(seed=1, force=True) == ALL
+    """The folder holds one run of each."""
+    margin, splats = load_config(None, ["control.margin=0.03"]), load_config(None, ["scene.max_splats=900"])
+    of_map, of_goal = ("scene", "replay", "report"), ("closed_loop", "report")
+    calls: list[tuple[dict[str, Any], tuple[str, ...]]] = [
+        *(({}, ALL), ({}, ()), ({"threads": 3}, ())),
+        *(({"config": margin}, ("replay", "report")), ({"config": splats}, of_map), ({}, of_map)),
+        *(({"goal_joints": (0.5,) * 7}, of_goal), ({"goal_joints": (0.4,) * 7}, of_goal)),
+        *(({"seed": 1}, of_map), ({"seed": 1, "base": BASE}, ALL)),
+        *(({"seed": 1, "base": BASE, "locked": {"joint1": 0.1}}, ALL), ({"seed": 1}, ALL)),
+        ({"seed": 1, "force": True}, ALL),
+    ]
+    assert [desk.steps_made(**changes) for changes, _ in calls] == [made for _, made in calls]
 
 
 def test_options_reach_every_step(desk: Desk) -> None:
-    options = SourceOptions(cameras=("cam1",))
+    options, pose = SourceOptions(cameras=("cam1",)), (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
     given = {"options": options, "config": load_config(None, ["control.margin=0.03"]), "seed": 3, "threads": 2}
-    pose = (0.4, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
     robot = {"base": BASE, "locked": {"joint1": 0.1}, "packages": (Path("meshes"),)}
     desk.steps_made(**given, **robot, device="cpu", resume=True, goal=pose, frame="hand")
     scene, replay, driven = (desk.requests[name] for name in ("scene", "replay", "closed_loop"))
+    expected = {"urdf": desk.request.urdf, "spheres": desk.request.spheres, "device": "cpu", **robot, **given}
+    del expected["options"]
     for each in (scene, replay, driven):
-        assert (each.config, each.seed, each.threads, each.device) == (given["config"], 3, 2, "cpu")
-        assert (each.urdf, each.spheres) == (desk.request.urdf, desk.request.spheres)
-        assert {name: getattr(each, name) for name in robot} == robot
+        assert {name: getattr(each, name) for name in expected} == expected
     assert scene.resume and replay.options == driven.options == options
     assert replay.scene == driven.scene == desk.request.out / "scene"
     assert (replay.mode, replay.goal, replay.frame) == ("audit", None, None)
@@ -180,24 +174,18 @@ def test_the_verdict_is_the_worse_one_of_logged_and_driven_motion(desk: Desk) ->
     page = (desk.request.out / "report.html").read_text()
     assert page.index("replay: FAILED (closed_loop)") < page.index("Logged motion") < page.index("Driven motion")
     words = json.loads((desk.request.out / "closed_loop" / "run.json").read_text())["arguments"]
-    assert words[-5:] == [
-        "--mode",
-        "closed-loop",
-        "--start-time",
-        "first-map",
-        f"--goal-joints={','.join(['0.5'] * 7)}",
-    ]
+    joints = f"--goal-joints={','.join(['0.5'] * 7)}"
+    assert words[-5:] == ["--mode", "closed-loop", "--start-time", "first-map", joints]
 
 
 def test_a_log_without_joints_has_its_map_and_check_alone(desk: Desk, tmp_path: Path) -> None:
     messages = [each for each in messages_of(desk.request.log) if each.topic.name != "/joint_states"]
     result = desk.audit(log=write_raw(tmp_path / "still.mcap", messages), urdf=None, spheres=None)
-    assert result.verdict.exit_code == 5
+    assert (result.verdict.exit_code, result.document["made"]) == (5, ["check", "scene", "report"])
     assert result.verdict.sentence == (
         "audit: NOT EVALUABLE (still.mcap): joint states: still.mcap has none, so no motion is judged, only the "
         "recording (check: passed) and its map (reconstruct: safe, scene); record /joint_states"
     )
-    assert result.document["made"] == ["check", "scene", "report"]
     assert result.verdict.sentence in result.document["page"].read_text()
 
 
@@ -238,16 +226,17 @@ def test_a_robot_by_name_is_one_of_an_installed_package(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = [tmp_path / name / "arm.urdf" for name in ("a", "b")]
-    installed(monkeypatch, [tmp_path / "arm.urdf", tmp_path / "arm.stl", tmp_path / "z1.urdf"])
+    mixed = [tmp_path / "arm.urdf", tmp_path / "arm.stl", tmp_path / "z1.urdf"]
+    installed(monkeypatch, mixed)
     assert desk.steps_made(urdf=None, robot="arm") == ALL
     assert desk.steps_made() == (), "the same robot by its file"
-    words = "--robot panda: expected one installed URDF of that name, got none; give one of: arm, z1"
-    expect_refusal(words, desk.audit, robot="panda", error=UsageError)
-    installed(monkeypatch, files)
-    words = f"got 2; give one with --urdf: {files[0]}, {files[1]}"
-    expect_refusal(words, desk.audit, robot="arm", error=UsageError)
-    installed(monkeypatch, [])
-    expect_refusal("got none; pip install example-robot-data", desk.audit, robot="arm", error=UsageError)
+    for name, found, words in (
+        ("panda", mixed, "--robot panda: expected one installed URDF of that name, got none; give one of: arm, z1"),
+        ("arm", files, f"got 2; give one with --urdf: {files[0]}, {files[1]}"),
+        ("arm", [], "got none; pip install example-robot-data"),
+    ):
+        installed(monkeypatch, found)
+        expect_refusal(words, desk.audit, robot=name, error=UsageError)
 
 
 def test_a_verdict_is_read_as_it_was_written() -> None:
@@ -257,13 +246,8 @@ def test_a_verdict_is_read_as_it_was_written() -> None:
 
 
 def test_progress_names_each_step_by_its_command(desk: Desk) -> None:
-    heard = Said()
-    audit(desk.request, heard)
-    assert [line.split(" /")[0] for line in heard.lines] == [
-        "check",
-        "$ splatctrl reconstruct",
-        "$ splatctrl replay",
-        "report",
-    ]
+    audit(desk.request, heard := Said())
+    steps = [line.split(" /")[0] for line in heard.lines]
+    assert steps == ["check", "$ splatctrl reconstruct", "$ splatctrl replay", "report"]
     audit(desk.request, again := Said())
     assert again.lines[0] == f"check: as before, {desk.request.out / 'check.json'}"

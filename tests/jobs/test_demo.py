@@ -30,9 +30,8 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
     monkeypatch.setattr(module, "_draw", lambda *_: None)
     request, before = DemoRequest(out=tmp_path / "out"), list(sys.argv)
     verdict = demo(request, perform)
-    assert (verdict.label, verdict.exit_code) == (label, damaged)
+    assert (verdict.label, verdict.exit_code, sys.argv) == (label, damaged, before)
     assert [reason.sentence for reason in verdict.decisive] == ["expected 'done', got 'exit code 3'"][:damaged]
-    assert sys.argv == before
     assert arguments == [["info", f"{tmp_path}/out/a"], ["info", "b"]], "what makes the same again"
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (run["command"], run["verdict"]["label"]) == ("demo", label)

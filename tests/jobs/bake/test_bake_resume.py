@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.bake import bake as bake_slabs
 from splatctrl_cli.records import Label
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked
-from tests.jobs.stage import contents, failing
+from tests.jobs.stage import contents, failing, patch_json
 from tests.refused import expect_refusal
 
 ROOT = Path(__file__).parents[3]
@@ -133,18 +133,16 @@ bake(Path(sys.argv[1]), Path(sys.argv[2]), resume=True, threads=int(sys.argv[3])
 def test_what_was_baked_otherwise_is_not_gone_on_with(
     splats: Path, tmp_path: Path, more: dict[str, Any], words: str
 ) -> None:
-    interrupted(splats, tmp_path / "field", 3)
-    with pytest.raises(UsageError, match=f"{re.escape(words)}.*bake without --resume"):
-        bake(splats, tmp_path / "field", resume=True, **more)
+    interrupted(splats, out := tmp_path / "field", 3)
+    said = f"{re.escape(words)}.*bake without --resume"
+    expect_refusal(said, bake, splats, out, resume=True, error=UsageError, **more)
     assert (tmp_path / "field.partial" / "channels" / "sdf.npy").is_file()
 
 
 @pytest.mark.usefixtures("small_slabs")
 def test_other_splats_are_not_gone_on_with(splats: Path, tmp_path: Path) -> None:
-    mine = tmp_path / "splats.ply"
-    shutil.copy(splats, mine)
+    mine, (centers, radii) = Path(shutil.copy(splats, tmp_path / "splats.ply")), cloud()
     interrupted(mine, tmp_path / "field", 3)
-    centers, radii = cloud()
     radii[3] *= 1.5
     write_ply(mine, splat_set(centers, radii + 0.001), {})
     expect_refusal(r"sha256 of splats\.ply was", bake, mine, tmp_path / "field", resume=True, error=UsageError)
@@ -154,9 +152,7 @@ def test_other_splats_are_not_gone_on_with(splats: Path, tmp_path: Path) -> None
 def test_progress_without_counts_is_not_gone_on_with(splats: Path, tmp_path: Path) -> None:
     interrupted(splats, tmp_path / "field", 3)
     file = tmp_path / "field.partial" / "channels" / "progress.json"
-    file.write_text(
-        json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != "counts"})
-    )
+    patch_json(file, lambda progress: {name: value for name, value in progress.items() if name != "counts"})
     expect_refusal(r"not readable.*counts.*bake without --resume", bake, splats, tmp_path / "field", resume=True)
 
 
@@ -164,8 +160,7 @@ def test_without_resume_an_interrupted_bake_is_replaced_with_a_warning(
     splats: Path, whole: dict[str, Any], tmp_path: Path
 ) -> None:
     interrupted(splats, tmp_path / "field", 1)
-    said = Said()
-    bake(splats, tmp_path / "field", progress=said)
+    bake(splats, tmp_path / "field", progress=(said := Said()))
     assert "an interrupted bake is replaced; --resume would have continued it" in said.lines[0]
     assert contents(tmp_path / "field") == whole
 
@@ -186,7 +181,13 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
     grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
     monkeypatch.setattr(grid_cells, "available_memory", lambda: 27 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz"])
-    with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
-        bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
+    expect_refusal(
+        r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats",
+        bake_slabs.check_vdb,
+        grid,
+        ["sdf"],
+        ["npz", "vdb"],
+        error=UsageError,
+    )
     monkeypatch.setattr(grid_cells, "available_memory", lambda: 28 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])

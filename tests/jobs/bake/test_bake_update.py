@@ -3,7 +3,9 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,9 @@ from splatctrl_cli.simulate.truth import load_truth
 from tests.cli.replay_desk import write_scene
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bake.baked import Said, baked, field_json
-from tests.jobs.stage import interrupt
+from tests.jobs.stage import interrupt, patch_json
 from tests.plain import known, plain_grid
+from tests.refused import expect_refusal
 
 BOX = (-0.6, -0.6, -0.5, 0.6, 0.6, 0.5)
 SECOND = 10**9
@@ -46,13 +49,11 @@ def after(splats: SplatSet) -> SplatSet:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of two snapshots that differ in two splats, and in what was seen."""
-    folder = tmp_path_factory.mktemp("scene")
+    folder, voxels = tmp_path_factory.mktemp("scene"), known(plain_grid((6, 6, 6), 0.5, -1.5))
     writer = SceneWriter(folder, {})
-    shape = (6, 6, 6)
-    occupancy = plain_grid(shape, 0.5, -1.5)
-    writer.snapshot(5 * SECOND, before(), known(occupancy), np.full(shape, 1, np.uint8))
-    writer.snapshot(7 * SECOND, after(before()), known(occupancy), np.full(shape, 2, np.uint8))
-    writer.finish(7 * SECOND, after(before()), known(occupancy))
+    writer.snapshot(5 * SECOND, before(), voxels, np.full((6, 6, 6), 1, np.uint8))
+    writer.snapshot(7 * SECOND, after(before()), voxels, np.full((6, 6, 6), 2, np.uint8))
+    writer.finish(7 * SECOND, after(before()), voxels)
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 7 * SECOND}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder
@@ -77,8 +78,7 @@ def npz(folder: Path) -> bytes:
 
 def test_an_update_is_the_whole_bake_to_the_byte(scene: Path, fields: Path, tmp_path: Path) -> None:
     bake(scene, tmp_path / "field", at=2, update=fields / "0")
-    assert npz(tmp_path / "field") == npz(fields / "2")
-    assert npz(fields / "0") != npz(fields / "2")
+    assert npz(tmp_path / "field") == npz(fields / "2") != npz(fields / "0")
     said = field_json(tmp_path / "field")
     update = said.pop("update")
     assert 0 < update["blocks_baked"] < 0.6 * update["blocks"]
@@ -100,12 +100,12 @@ def test_an_update_can_be_in_slabs_and_interrupted(
 
 def test_a_bare_file_needs_its_predecessor(tmp_path: Path) -> None:
     old, new = tmp_path / "old.ply", tmp_path / "new.ply"
-    write_ply(old, before(), {})
-    write_ply(new, after(before()), {})
-    bake(old, tmp_path / "first", box=BOX)
-    bake(new, tmp_path / "whole", box=BOX)
-    with pytest.raises(UsageError, match="was not baked from the splats of"):
-        bake(new, tmp_path / "field", update=tmp_path / "first")
+    for path, splats, field in ((old, before(), "first"), (new, after(before()), "whole")):
+        write_ply(path, splats, {})
+        bake(path, tmp_path / field, box=BOX)
+    expect_refusal(
+        "was not baked from the splats of", bake, new, tmp_path / "field", update=tmp_path / "first", error=UsageError
+    )
     bake(new, tmp_path / "field", update=tmp_path / "first", previous_scene=old)
     assert npz(tmp_path / "field") == npz(tmp_path / "whole")
 
@@ -118,8 +118,7 @@ def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(scene: Path,
     assert said.lines == ["--update: every block is baked anew: every splat reaches every cell of gpdf"]
     assert npz(tmp_path / "field") == npz(tmp_path / "2")
     update = field_json(tmp_path / "field")["update"]
-    assert update["blocks_baked"] == update["blocks"]
-    assert "gpdf" in update["why_all"]
+    assert update["blocks_baked"] == update["blocks"] and "gpdf" in update["why_all"]
 
 
 @pytest.mark.parametrize(
@@ -136,43 +135,58 @@ def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(scene: Path,
 def test_what_was_baked_otherwise_is_not_updated(
     scene: Path, fields: Path, tmp_path: Path, more: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(UsageError, match=f"{re.escape(words)}.*bake without --update"):
-        bake(scene, tmp_path / "field", update=fields / "0", **more)
+    expect_refusal(
+        f"{re.escape(words)}.*bake without --update",
+        bake,
+        scene,
+        tmp_path / "field",
+        update=fields / "0",
+        error=UsageError,
+        **more,
+    )
     assert not list(tmp_path.iterdir())
+
+
+def cut(field: Path) -> None:
+    (field / "field.npz").write_bytes((field / "field.npz").read_bytes()[:-2000])
+
+
+def replace_arrays(field: Path) -> None:
+    np.savez(field / "field.npz", a=np.zeros(3))
+
+
+def remove(field: Path) -> None:
+    (field / "field.npz").unlink()
+
+
+def break_run(field: Path) -> None:
+    (field / "run.json").write_text("{")
+
+
+def change_run(field: Path, **changes: str) -> None:
+    patch_json(field / "run.json", lambda run: run | changes)
 
 
 @pytest.mark.parametrize(
     ("harm", "code", "words"),
     [
-        ("cut", 4, "field.npz: was changed after it was written"),
-        ("foreign", 4, "field.npz: was changed after it was written"),
-        ("no npz", 4, "field.npz: missing"),
-        ("no run", 4, "has no readable run.json"),
-        ("other version", 2, "got one of sdf-bake of 0.0.0"),
-        ("other command", 2, "got one of replay of"),
+        (cut, 4, "field.npz: was changed after it was written"),
+        (replace_arrays, 4, "field.npz: was changed after it was written"),
+        (remove, 4, "field.npz: missing"),
+        (break_run, 4, "has no readable run.json"),
+        (partial(change_run, splatctrl="0.0.0"), 2, "got one of sdf-bake of 0.0.0"),
+        (partial(change_run, command="replay"), 2, "got one of replay of"),
     ],
+    ids=["cut", "foreign", "no npz", "no run", "other version", "other command"],
 )
 def test_a_damaged_or_foreign_field_is_not_updated(
-    scene: Path, fields: Path, tmp_path: Path, harm: str, code: int, words: str
+    scene: Path, fields: Path, tmp_path: Path, harm: Callable[[Path], None], code: int, words: str
 ) -> None:
-    old = tmp_path / "old"
-    shutil.copytree(fields / "0", old)
-    file, run = old / "field.npz", json.loads((old / "run.json").read_text())
-    if harm == "cut":
-        file.write_bytes(file.read_bytes()[:-2000])
-    elif harm == "foreign":
-        np.savez(file, a=np.zeros(3))
-    elif harm == "no npz":
-        file.unlink()
-    elif harm == "no run":
-        (old / "run.json").write_text("{")
-    else:
-        run |= {"splatctrl": "0.0.0"} if harm == "other version" else {"command": "replay"}
-        (old / "run.json").write_text(json.dumps(run))
+    harm(shutil.copytree(fields / "0", tmp_path / "old"))
     with pytest.raises(SplatCtrlError, match=words) as refused:
-        bake(scene, tmp_path / "field", update=old)
+        bake(scene, tmp_path / "field", update=tmp_path / "old")
     assert refused.value.exit_code == code
-    assert not (tmp_path / "field").exists() and not (tmp_path / "field.partial").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
 
 
 TRUE_BOX = np.array([[0.4, -0.15, -0.05], [0.7, 0.15, 0.2]])
@@ -201,23 +215,28 @@ def test_held_out_depth_agrees_with_splats_on_the_true_surface(
     robot = {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
     held_out = {"held_out": folder / "log.mcap", "held_out_cameras": ("cam3",)}
     found = bake_true(true_splats, tmp_path / "field", **held_out, **robot).document["accuracy"]["held_out_depth"]
-    assert found["num_frames"] == 1
+    near, least = found["before"]["seen"]["sdf"][0], found["on_surface"]["hard"]["median"]
     half_a_cell = 0.015  # which the interpolation of a surface between two cells may read on it
-    near = found["before"]["seen"]["sdf"][0]
-    assert 0 < found["on_surface"]["hard"]["median"] < half_a_cell
-    assert abs(near["median"]) < half_a_cell
-    assert near["count"] > 20
+    assert 0 < least < half_a_cell and abs(near["median"]) < half_a_cell
+    assert found["num_frames"] == 1 and near["count"] > 20
     with_robot = bake_true(true_splats, tmp_path / "robot", **held_out).document["accuracy"]["held_out_depth"]
     assert with_robot["num_measured"] > found["num_measured"], (
-        "pixels of the robot count where nobody says where it is"
+        "the robot's pixels count where nothing says where it is"
     )
 
 
 def test_depth_later_than_the_scene_does_not_count(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", (1, read_ply(true_splats)[0]))
     log = sample_data / "tabletop" / "log.mcap"
-    with pytest.raises(NotEvaluableError, match="no frame of cam3 up to the time of the scene"):
-        bake_true(scene, tmp_path / "field", held_out=log, held_out_cameras=("cam3",))
+    expect_refusal(
+        "no frame of cam3 up to the time of the scene",
+        bake_true,
+        scene,
+        tmp_path / "field",
+        held_out=log,
+        held_out_cameras=("cam3",),
+        error=NotEvaluableError,
+    )
 
 
 def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
@@ -225,10 +244,9 @@ def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, 
     truth = {"truth": folder / "truth.json", "seen_by": folder / "log.mcap"}
     result = bake_true(true_splats, tmp_path / "field", **truth, with_probability=True, no_report=False)
     found = result.document["accuracy"]["truth"]
-    assert 0 < found["error_sigma"] < 0.02
     calibrated, paper = found["reliability"]["calibrated"], found["reliability"]["paper"]
     assert calibrated["count"].sum() == paper["count"].sum() > 50
-    assert calibrated["calibration_error"] < 0.2
+    assert 0 < found["error_sigma"] < 0.02 and calibrated["calibration_error"] < 0.2
     pictures = sorted(path.name for path in (tmp_path / "field" / "report").iterdir())
     assert pictures == ["gradient.png", "probability.png", "reliability.png", "slices.png"]
 
@@ -240,8 +258,7 @@ def test_a_mesh_is_compared_with(tmp_path: Path) -> None:
     write_ply(tmp_path / "splats.ply", splat_set(np.array(ball.vertices), np.full(len(ball.vertices), 0.001)), {})
     bake_true(tmp_path / "splats.ply", tmp_path / "field", reference_mesh=tmp_path / "ball.ply")
     found = field_json(tmp_path / "field")["accuracy"]["reference_mesh"]
-    assert found["file"] == "ball.ply"
-    assert found["is_closed"] is True
+    assert found["file"] == "ball.ply" and found["is_closed"] is True
     assert all(band["rmse"] < 0.003 for band in found["everywhere"]["hard"] if band["count"])
 
 
@@ -267,22 +284,31 @@ def spheres(num: int = 5, seed: int = 0) -> SplatSet:
 
 
 def test_an_empty_set_is_refused(tmp_path: Path) -> None:
-    with pytest.raises((InputError, NotEvaluableError)):
-        bake_splats(spheres().select(np.zeros(5, bool)), tmp_path)
-    with pytest.raises(NotEvaluableError, match="none of 5 is labelled object, human; give a scene that has some"):
-        bake_splats(replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)), tmp_path)
+    expect_refusal(
+        "", bake_splats, spheres().select(np.zeros(5, bool)), tmp_path, error=(InputError, NotEvaluableError)
+    )
+    expect_refusal(
+        "none of 5 is labelled object, human; give a scene that has some",
+        bake_splats,
+        replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)),
+        tmp_path,
+        error=NotEvaluableError,
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["splats.ply"]
 
 
-@pytest.mark.parametrize("name", ["one", "duplicates", "tiny radii", "mixed radii"])
-def test_odd_splats_are_baked(tmp_path: Path, name: str) -> None:
-    made = {
-        "one": spheres(1),
-        "duplicates": splat_set(np.zeros((40, 3)), np.full(40, 0.01)),
-        "tiny radii": splat_set(cloud(40)[0], np.full(40, 1e-9)),
-        "mixed radii": splat_set(cloud(40)[0], np.geomspace(0.001, 0.3, 40)),
-    }
-    bake_splats(made[name], tmp_path, box=SMALL_BOX, channels=("gradient", "bound", "hard", "se", "gpdf", "label"))
+@pytest.mark.parametrize(
+    "splats",
+    [
+        spheres(1),
+        splat_set(np.zeros((40, 3)), np.full(40, 0.01)),
+        splat_set(cloud(40)[0], np.full(40, 1e-9)),
+        splat_set(cloud(40)[0], np.geomspace(0.001, 0.3, 40)),
+    ],
+    ids=["one", "duplicates", "tiny radii", "mixed radii"],
+)
+def test_odd_splats_are_baked(tmp_path: Path, splats: SplatSet) -> None:
+    bake_splats(splats, tmp_path, box=SMALL_BOX, channels=("gradient", "bound", "hard", "se", "gpdf", "label"))
     channels = read_npz(tmp_path / "field" / "field.npz").channels
     assert all(np.isfinite(values).all() for values in channels.values())
     assert (channels["sdf"] <= channels["hard"]).all()

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pytest
 
 from splatctrl_cli.files.output import partial_path
 from splatctrl_cli.jobs.batch.batch import verdict_of_runs
+from splatctrl_cli.jobs.batch.graph import Node
 from splatctrl_cli.jobs.batch.ledger import Ledger, Run
 from splatctrl_cli.jobs.batch.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batch.task import End, Task, run_task, stop_runners
@@ -35,19 +36,19 @@ def test_what_is_done_is_kept_and_what_changed_runs_again_with_what_needs_it(tmp
     second = node(tmp_path, "a/second", "tell", str(tmp_path / "t2"), needs=["a/first"])
     other = node(tmp_path, "b/first", "tell", str(tmp_path / "t3"))
     nodes = [first, second, other]
-    assert states(batch_of(tmp_path, nodes)) == dict.fromkeys(("a/first", "a/second", "b/first"), DONE)
-    batch_of(tmp_path, nodes)
-    assert [count(tmp_path / f"t{k}") for k in (1, 2, 3)] == [1, 1, 1]
+
+    def counts(nodes: Sequence[Node], **more: bool) -> list[int]:
+        """How often each ran so far, after a batch of some."""
+        assert {*states(batch_of(tmp_path, nodes, **more)).values()} == {DONE}
+        return [count(tmp_path / f"t{k}") for k in (1, 2, 3)]
+
+    assert [counts(nodes), counts(nodes)] == [[1, 1, 1]] * 2
     given.write_text("two")
-    batch_of(tmp_path, nodes)
-    assert [count(tmp_path / f"t{k}") for k in (1, 2, 3)] == [2, 2, 1], "the input of the first changed"
-    batch_of(tmp_path, [first, replace(second, words=(*second.words, "say", "more")), other])
-    assert [count(tmp_path / f"t{k}") for k in (1, 2, 3)] == [2, 3, 1], "words changed"
+    assert counts(nodes) == [2, 2, 1], "the input of the first changed"
+    assert counts([first, replace(second, words=(*second.words, "say", "more")), other]) == [2, 3, 1], "words changed"
     (tmp_path / "b/first/run.json").write_text("changed by hand")
-    batch_of(tmp_path, nodes[2:])
-    assert count(tmp_path / "t3") == 2
-    batch_of(tmp_path, nodes[2:], again=True)
-    assert count(tmp_path / "t3") == 3
+    assert counts(nodes[2:]) == [2, 3, 2]
+    assert counts(nodes[2:], again=True) == [2, 3, 3]
 
 
 def test_one_node_that_fails_stops_only_what_needs_its_output(tmp_path: Path) -> None:
@@ -93,8 +94,8 @@ def test_an_expected_outcome_is_the_good_one(tmp_path: Path) -> None:
 
 
 def test_an_expected_error_stands_too(tmp_path: Path) -> None:
-    nodes = [node(tmp_path, "a/job", "tell", str(tmp_path / "told"), "exit", "4", expect="exit 4")]
-    nodes = [replace(nodes[0], words=nodes[0].words[:4])]  # writes nothing
+    job = node(tmp_path, "a/job", "tell", str(tmp_path / "told"), "exit", "4", expect="exit 4")
+    nodes = [replace(job, words=job.words[:4])]  # writes nothing
     assert states(batch_of(tmp_path, nodes)) == states(batch_of(tmp_path, nodes)) == {"a/job": DONE}
     assert count(tmp_path / "told") == 1
 
@@ -113,8 +114,7 @@ def test_a_killed_node_is_a_result_with_its_cause(
     start = time.monotonic()
     runs = batch_of(tmp_path, [node(tmp_path, "a/job", *words, **limits), node(tmp_path, "b/job")])
     assert time.monotonic() - start < 25
-    assert states(runs) == {"a/job": ERROR, "b/job": DONE}
-    assert runs["a/job"].cause == cause
+    assert (states(runs), runs["a/job"].cause) == ({"a/job": ERROR, "b/job": DONE}, cause)
     assert runs["a/job"].peak_mb > (290 if limits.get("memory") else 5)
 
 
@@ -203,8 +203,7 @@ def test_a_node_goes_on_only_where_something_was_begun(tmp_path: Path) -> None:
 
 
 def test_a_runner_that_is_killed_is_replaced(tmp_path: Path) -> None:
-    nodes = [node(tmp_path, "a/job", "kill-parent", retries=0), node(tmp_path, "b/job")]
-    runs = batch_of(tmp_path, nodes, workers=1)
+    runs = batch_of(tmp_path, [node(tmp_path, "a/job", "kill-parent", retries=0), node(tmp_path, "b/job")], workers=1)
     assert states(runs) == {"a/job": ERROR, "b/job": DONE}
     assert runs["a/job"].cause == "its runner was killed twice"
 

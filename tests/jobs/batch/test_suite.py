@@ -18,10 +18,15 @@ RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
 ROBOT = 'urdf = "arm.urdf"\n'
 
 
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
 def nodes(folder: Path, text: str, shard: tuple[int, int] = (1, 1)) -> list[Node]:
     """The graph of a suite's text beside two logs."""
-    for name in ("a.mcap", "b.mcap", "arm.urdf"):
-        (folder / name).touch()
+    touch(folder, "a.mcap", "b.mcap", "arm.urdf")
     (folder / "suite.toml").write_text(text)
     suite = read_suite(folder / "suite.toml", COMMANDS)
     return select_shard(nodes_of(suite, folder / "out", OfThisProgram(threads=1)), shard)
@@ -37,11 +42,10 @@ def test_each_recording_goes_through_each_job_with_what_the_jobs_before_made(tmp
     jobs += f"[jobs.audit]\ncommand = 'replay'\n{ROBOT}"
     found = {node.name: node for node in nodes(tmp_path, RECORDINGS + jobs)}
     assert set(found) == {f"{name}/{job}" for name in "ab" for job in ("ingest", "scene", "check", "audit")}
-    audit, out = found["a/audit"], tmp_path / "out/a"
-    assert set(audit.needs) == {"a/ingest", "a/scene"}
+    audit, out, check = found["a/audit"], tmp_path / "out/a", found["b/check"]
+    assert (set(audit.needs), audit.inputs) == ({"a/ingest", "a/scene"}, (tmp_path / "arm.urdf",))
     assert options(audit)["--scene"] == str(out / "scene") and audit.words[-1] == str(out / "ingest.capture")
-    assert audit.inputs == (tmp_path / "arm.urdf",)
-    assert found["b/check"].words[-1] == str(tmp_path / "b.mcap") and found["b/check"].out is None
+    assert (check.words[-1], check.out) == (str(tmp_path / "b.mcap"), None)
     names = list(found)
     assert all(names.index(need) < names.index(name) for name, node in found.items() for need in node.needs)
 
@@ -91,10 +95,7 @@ def test_nodes_and_columns_come_in_the_order_of_the_suite(tmp_path: Path) -> Non
 
 
 def test_the_names_of_variants_say_only_what_differs(tmp_path: Path) -> None:
-    (tmp_path / "arms/b").mkdir(parents=True)
-    (tmp_path / "arms/a").mkdir()
-    for place in ("a/panda.urdf", "b/panda.urdf", "a/wrist.yaml", "b/coarse.yaml"):
-        (tmp_path / "arms" / place).touch()
+    touch(tmp_path / "arms", "a/panda.urdf", "b/panda.urdf", "a/wrist.yaml", "b/coarse.yaml")
     jobs = """
 [jobs.scene]
 command = "reconstruct"
@@ -122,22 +123,15 @@ def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> N
     }
     assert set(found) == {"a/check", "a/ingest", "both/check"}
     assert (options(found["a/check"])["--fail-on"], found["a/check"].job.expect) == ("warning", "exit 1")
-    assert found["both/check"].words[-2:] == (str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"))
-    assert found["both/check"].job.expect == "passed"
-    assert (found["a/check"].job.timeout, found["a/check"].job.memory) == (120.0, 2**30)
+    check, both = found["a/check"], found["both/check"]
+    assert both.words[-2:] == (str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"))
+    assert (both.job.expect, check.job.timeout, check.job.memory) == ("passed", 120.0, 2**30)
 
 
 def test_recordings_of_one_file_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
-    for place in (
-        "a/2025/log.mcap",
-        "b/2025/log.mcap",
-        "b/2025/arm.bag",
-        "c/arm.mcap",
-        "c/wrist.mcap",
-        "c/wrist.bag",
-    ):
-        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / place).touch()
+    touch(
+        tmp_path, "a/2025/log.mcap", "b/2025/log.mcap", "b/2025/arm.bag", "c/arm.mcap", "c/wrist.mcap", "c/wrist.bag"
+    )
     text = "[[recordings]]\npaths = ['**/*.mcap', '**/*.bag']\n[[recordings]]\nname = 'arm'\npaths = ['a.mcap']\n"
     found = [node.recording for node in nodes(tmp_path, text + "[jobs.check]\n".replace("'a.mcap'", "'c/arm.mcap'"))]
     assert found == ["2025-arm", "a", "a-2025-log", "arm", "b", "b-2025-log", "c-arm", "wrist.bag", "wrist.mcap"]

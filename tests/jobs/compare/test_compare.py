@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
 from splatctrl_cli.jobs.compare import judged_runs
@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.compare.compare import Change, CompareRequest, CompareRe
 from splatctrl_cli.jobs.replay.metrics import metric_scales
 from splatctrl_cli.jobs.report.report import WriteReportRequest, write_report
 from tests.jobs.stage import Runs
+from tests.refused import expect_refusal
 
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
 NEAR |= {"place": [1.0, 2.0, 3.0], "cause": "near splat 7", "remedy": "stop"}
@@ -30,21 +31,17 @@ def audit(older: Path) -> Path:
     return older / "audit"
 
 
-def edited(source: Path, target: Path, **metrics: float | None) -> Path:
-    """A copy of a run with other metrics."""
-
-    def edit(document: dict[str, Any]) -> None:
-        document["metrics"] |= metrics
-
-    return changed(source, target, edit)
-
-
 def changed(source: Path, target: Path, edit: Edit) -> Path:
+    """A copy of a run with another run.json."""
     shutil.copytree(source, target)
     document = json.loads((target / "run.json").read_text())
     edit(document)
     (target / "run.json").write_text(json.dumps(document))
     return target
+
+
+def edited(source: Path, target: Path, **metrics: float | None) -> Path:
+    return changed(source, target, lambda document: document["metrics"].update(metrics))
 
 
 def compared(*runs: Path, **more: Path) -> CompareResult:
@@ -64,9 +61,8 @@ def test_a_figure_that_is_worse_by_more_than_its_tolerance_fails_with_recording_
     audit: Path, tmp_path: Path
 ) -> None:
     result = compared(audit, edited(audit, tmp_path / "new", min_clearance=0.0158571522 - 0.0011))
-    (one,) = result.figures
+    (one,), reason = result.figures, result.verdict.decisive[0]
     assert (result.verdict.exit_code, one.metric, one.change) == (1, "min_clearance", Change.WORSE)
-    reason = result.verdict.decisive[0]
     assert (reason.criterion, reason.time_s, reason.who, reason.label) == ("min_clearance", 0.92, "new", "regression")
     assert reason.cause == "state 46, hand[11] near unrepresented voxel at (0.427, 0.389, 0.178)"
     assert reason.threshold == pytest.approx(0.0158571522 - 0.001)
@@ -88,8 +84,8 @@ def test_direction_and_tolerance_decide(
     audit: Path, tmp_path: Path, metrics: dict[str, float | None], change: Change | None, code: int
 ) -> None:
     result = compared(audit, edited(audit, tmp_path / "new", **metrics))
-    assert [one.change for one in result.figures] == ([] if change is None else [change])
-    assert result.verdict.exit_code == code
+    found = [one.change for one in result.figures], result.verdict.exit_code
+    assert found == ([] if change is None else [change], code)
 
 
 def test_what_got_worse_first_is_what_left_its_tolerance_farthest_behind(audit: Path, tmp_path: Path) -> None:
@@ -119,12 +115,10 @@ def test_only_a_verdict_from_green_to_red_is_a_regression(
     result = compared(old, changed(audit, tmp_path / "new", judged(*after)))
     (one,) = result.verdicts
     assert (one["before"], one["after"], one["change"]) == (before[1], after[1], change)
-    assert result.verdict.exit_code == code
     assert any(f"from '{before[1]}' to '{after[1]}'" in reason.sentence for reason in result.verdict.reasons)
-    if code:
-        reason = result.verdict.decisive[0]
-        assert "clearance: hand[9] is 4 mm away" in reason.sentence
-        assert (reason.time_s, reason.place, reason.remedy) == (1.5, (1.0, 2.0, 3.0), "stop")
+    decisive = result.verdict.decisive
+    told = [(r.time_s, r.place, r.remedy, "clearance: hand[9] is 4 mm away" in r.sentence) for r in decisive]
+    assert (told, result.verdict.exit_code) == ([(1.5, (1.0, 2.0, 3.0), "stop", True)] * code, code)
 
 
 def test_settings_versions_and_inputs_that_differ_are_named(audit: Path, tmp_path: Path) -> None:
@@ -135,8 +129,7 @@ def test_settings_versions_and_inputs_that_differ_are_named(audit: Path, tmp_pat
 
     result = compared(audit, changed(audit, tmp_path / "new", edit))
     assert set(result.differences) == {"control.margin", "numpy", "input robot.urdf"}
-    assert result.differences["control.margin"] == ("0.02", "0.03")
-    assert result.verdict.exit_code == 0
+    assert (result.differences["control.margin"], result.verdict.exit_code) == (("0.02", "0.03"), 0)
 
 
 def test_nothing_on_both_sides_is_not_evaluable(audit: Path, tmp_path: Path) -> None:
@@ -166,24 +159,25 @@ def batch_of(
 
 def test_a_batch_fails_where_one_recording_got_worse_and_names_it(audit: Path, tmp_path: Path) -> None:
     old = batch_of(tmp_path / "old", audit, {"a": {}, "b": {}})
-    new = batch_of(tmp_path / "new", audit, {"a": {}, "b": {"min_clearance": 0.001}, "c": {}})
-    result = compared(old, new)
-    (reason,) = result.verdict.decisive
-    assert (reason.criterion, reason.who, reason.time_s) == ("min_clearance of b/audit", "b", 0.92)
-    assert result.only_after == ("c/audit",)
+    result = compared(old, batch_of(tmp_path / "new", audit, {"a": {}, "b": {"min_clearance": 0.001}, "c": {}}))
+    found = [(reason.criterion, reason.who, reason.time_s) for reason in result.verdict.decisive]
+    assert (found, result.only_after) == ([("min_clearance of b/audit", "b", 0.92)], ("c/audit",))
     assert any("c/audit" in one.sentence for one in result.verdict.shown)
 
 
 def test_a_node_that_ended_as_expected_and_does_no_more_is_a_regression(audit: Path, tmp_path: Path) -> None:
-    old = batch_of(tmp_path / "old", audit, {"a": {}}, lambda node: node.update(state="done", expect="failed"))
-    new = batch_of(tmp_path / "new", audit, {"a": {}}, lambda n: n.update(outcome="passed", label="safe"))
-    assert compared(old, new).verdict.exit_code == 1
-    assert compared(new, old).verdict.exit_code == 0
-    gone = batch_of(
-        tmp_path / "x", audit, {"a": {}}, lambda n: n.update(state="error", outcome=None, cause="timed out")
+    sides = {
+        "old": {"state": "done", "expect": "failed"},
+        "new": {"outcome": "passed", "label": "safe"},
+        "gone": {"state": "error", "outcome": None, "cause": "timed out"},
+    }
+    old, new, gone = (
+        batch_of(tmp_path / name, audit, {"a": {}}, lambda node, more=more: node.update(more))
+        for name, more in sides.items()
     )
-    result = compared(old, gone)
-    assert (result.verdict.exit_code, result.verdicts[0]["after"]) == (1, "timed out")
+    results = [compared(old, new), compared(new, old), compared(old, gone)]
+    assert [result.verdict.exit_code for result in results] == [1, 0, 1]
+    assert results[2].verdicts[0]["after"] == "timed out"
 
 
 def test_a_node_without_run_json_is_read_from_what_it_printed(audit: Path, tmp_path: Path) -> None:
@@ -217,14 +211,12 @@ def test_over_eight_recordings_the_interval_of_the_mean_decides(
     new = batch_of(tmp_path / "new", audit, {f"r{i}": {"min_clearance": base - d} for i, d in enumerate(drops)})
     result = compared(old, new)
     (one,) = [job for job in result.jobs if job.metric == "min_clearance"]
-    assert one.change is change
+    assert (one.change, result.verdict.exit_code) == (change, 1 if change is Change.WORSE else 0)
     assert one.harm.low <= one.harm.mean <= one.harm.high
-    assert result.verdict.exit_code == (1 if change is Change.WORSE else 0)
     assert compared(old, new) == result, "seeded"
     assert any("r0/audit" in note.sentence for note in result.verdict.shown) == (drops[0] == 0.02)
-    if change is Change.WORSE:
-        assert result.verdict.decisive[0].who == "r0"
-        assert "95 % interval 0.004 to 0.004" in result.verdict.decisive[0].sentence
+    decisive = [(reason.who, "95 % interval 0.004 to 0.004" in reason.sentence) for reason in result.verdict.decisive]
+    assert decisive[:1] == [("r0", True)] * (change is Change.WORSE)
 
 
 def test_a_figure_that_one_recording_lost_is_a_regression_whatever_the_mean(audit: Path, tmp_path: Path) -> None:
@@ -253,17 +245,17 @@ def test_a_baseline_reads_back_as_what_it_was_made_of(audit: Path, tmp_path: Pat
     assert stored["min_clearance"] == pytest.approx(0.0158571522, rel=1e-8)
     assert "num_states" not in stored, "it has no direction"
     assert [*stored] == sorted(stored)
-    assert compared(audit, against=file).verdict.exit_code == 0
     worse = edited(audit, tmp_path / "new", min_clearance=0.01)
-    assert compared(worse, against=file, update_baseline=file).verdict.exit_code == 1
-    differing = set(text.splitlines()) ^ set(file.read_text().splitlines())
-    assert differing == {
+    given = ({}, {"update_baseline": file}, {})
+    runs = (audit, worse, worse)
+    codes = [compared(run, against=file, **more).verdict.exit_code for run, more in zip(runs, given, strict=True)]
+    assert codes == [0, 1, 0]
+    assert set(text.splitlines()) ^ set(file.read_text().splitlines()) == {
         'recording = "audit"',
         'recording = "new"',
         "min_clearance = 0.0158571522",
         "min_clearance = 0.01",
     }
-    assert compared(worse, against=file).verdict.exit_code == 0
 
 
 @pytest.mark.parametrize("is_stored", [False, True])
@@ -291,25 +283,23 @@ def test_a_shard_of_a_batch_is_compared_and_the_others_are_named(
     assert "a/audit, c/audit" in page.read_text()
 
 
-def refused(words: str, *runs: Path, kind: type[SplatCtrlError] = InputError, **more: Path) -> None:
-    with pytest.raises(kind, match=words):
-        compared(*runs, **more)
-
-
 def test_what_cannot_be_compared_is_refused_by_name(audit: Path, tmp_path: Path) -> None:
-    refused("scene: expected a run of replay, as .*audit is, got one of reconstruct", audit, audit.parent / "scene")
-    refused(r"tabletop\.capture: a run of ingest, which judges nothing", audit, audit.parent / "tabletop.capture")
-    refused("missing: expected the output folder .* no such folder", audit, audit.parent / "missing")
-    shutil.copytree(audit, tmp_path / "a.partial")
-    refused(r"a\.partial: is still being written", audit, tmp_path / "a.partial")
-    refused("a: is still being written", audit, tmp_path / "a")
+    partial = shutil.copytree(audit, tmp_path / "a.partial")
     one, two = batch_of(tmp_path / "1", audit, {"a": {}}), batch_of(tmp_path / "2", audit, {"b": {}})
-    refused(r"1: expected some of the runs of .*2 \(b/audit\), got a/audit", two, one)
-    refused("expected a run like .*audit, got a batch", audit, one)
     other = batch_of(tmp_path / "3", audit, {"a": {}}, lambda node: node.update(command="score"))
-    refused("a/audit: expected a run of replay, got one of score", one, other)
-    refused("expected two runs, or one and --against, got 1", audit, kind=UsageError)
-    refused("got 2", audit, audit, kind=UsageError, against=tmp_path / "base.toml")
+    for words, *runs in (
+        ("scene: expected a run of replay, as .*audit is, got one of reconstruct", audit, audit.parent / "scene"),
+        (r"tabletop\.capture: a run of ingest, which judges nothing", audit, audit.parent / "tabletop.capture"),
+        ("missing: expected the output folder .* no such folder", audit, audit.parent / "missing"),
+        (r"a\.partial: is still being written", audit, partial),
+        ("a: is still being written", audit, tmp_path / "a"),
+        (r"1: expected some of the runs of .*2 \(b/audit\), got a/audit", two, one),
+        ("expected a run like .*audit, got a batch", audit, one),
+        ("a/audit: expected a run of replay, got one of score", one, other),
+    ):
+        expect_refusal(words, compared, *runs)
+    expect_refusal("expected two runs, or one and --against, got 1", compared, audit, error=UsageError)
+    expect_refusal("got 2", compared, audit, audit, error=UsageError, against=tmp_path / "base.toml")
 
 
 @pytest.mark.parametrize(
@@ -331,30 +321,29 @@ def test_a_baseline_of_other_figures_or_a_newer_version_is_refused(
     compared(without, update_baseline=file)
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
-    refused(words, without, against=file)
+    expect_refusal(words, compared, without, against=file)
 
 
 def test_another_file_is_never_replaced_by_a_baseline(audit: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.toml").write_text("mine = 1\n")
-    refused("exists, and is no baseline", audit, kind=UsageError, update_baseline=tmp_path / "notes.toml")
+    file = tmp_path / "notes.toml"
+    expect_refusal("exists, and is no baseline", compared, audit, error=UsageError, update_baseline=file)
     assert (tmp_path / "notes.toml").read_text() == "mine = 1\n"
 
 
 def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() -> None:
     declared = judged_runs.scales()["replay"]
-    for mode in ("audit", "open-loop", "closed-loop"):
-        fields = ("exact", "barrier", "certified")
-        assert set(metric_scales(mode, fields, has_truth=True, has_twists=True)) <= set(declared)
-    assert declared["min_clearance"].better is Better.HIGHER
-    assert declared["num_in_collision"].better is Better.LOWER
+    modes, fields = ("audit", "open-loop", "closed-loop"), ("exact", "barrier", "certified")
+    assert all({*metric_scales(mode, fields, has_truth=True, has_twists=True)} <= {*declared} for mode in modes)
+    better = [declared[name].better for name in ("min_clearance", "num_in_collision")]
+    assert better == [Better.HIGHER, Better.LOWER]
     assert all(scale.absolute >= 0 and scale.relative >= 0 for scale in declared.values())
 
 
 def test_a_margin_that_was_taken_away_is_found_with_the_state_where_it_shows(run: Runs) -> None:
     before, after = run("before", "closed-loop"), run("after", "closed-loop", "--set", "control.margin=0.002")
     result = compared(before, after)
-    assert result.verdict.exit_code == 1
-    assert result.differences["control.margin"] == ("0.02", "0.002")
+    assert (result.verdict.exit_code, result.differences["control.margin"]) == (1, ("0.02", "0.002"))
     worst = next(one for one in result.figures if one.metric == "min_clearance")
     assert worst.change is Change.WORSE and worst.where is not None and "ball" not in worst.where.sphere
     with (after / "steps.csv").open() as stream:

@@ -35,18 +35,14 @@ def read_back(path: Path) -> Messages:
     found: Messages = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        encodings = {channel.topic: channel.message_encoding for channel in reader.get_summary().channels.values()}
+        protobuf = [topic for topic, encoding in encodings.items() if encoding == "protobuf"]
         for _, channel, message in reader.iter_messages():
             if channel.message_encoding == "json":
                 found.setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
-        for _, channel, message, decoded in reader.iter_decoded_messages(topics=protobuf_topics(path)):
+        for _, channel, message, decoded in reader.iter_decoded_messages(topics=protobuf):
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
     return found
-
-
-def protobuf_topics(path: Path) -> list[str]:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    return [channel.topic for channel in summary.channels.values() if channel.message_encoding == "protobuf"]
 
 
 def unpacked(message: Any, names: Mapping[int, str]) -> np.ndarray[Any, Any]:
@@ -73,31 +69,26 @@ def test_the_splats_of_each_time_are_clouds(run: Runs, tmp_path: Path) -> None:
     clouds = logged(run())["/splats"]
     assert [stamp for stamp, _ in clouds] == [QUARTER * i for i in range(5)]
     for stamp, cloud in clouds:
-        splats = open_scene(tmp_path / "scene").splats_at(stamp)
-        values = unpacked(cloud, NUMBERS)
-        assert cloud.frame_id == "world"
-        assert cloud.timestamp.ToNanoseconds() == stamp
-        np.testing.assert_array_equal(np.column_stack([values[axis] for axis in "xyz"]), splats.centers)
-        np.testing.assert_array_equal(values["radius"], splats.radii)
-        np.testing.assert_array_equal(values["label"], splats.labels)
+        splats, values = open_scene(tmp_path / "scene").splats_at(stamp), unpacked(cloud, NUMBERS)
+        assert (cloud.frame_id, cloud.timestamp.ToNanoseconds()) == ("world", stamp)
+        points = np.column_stack([values[name] for name in ("x", "y", "z", "radius", "label")])
+        np.testing.assert_array_equal(points, np.column_stack([splats.centers, splats.radii, splats.labels]))
         np.testing.assert_allclose(values["alpha"] / 255, splats.opacities, atol=0.002)
 
 
 def test_every_link_is_where_the_robot_has_it_and_our_own_reader_reads_it_too(run: Runs, arm: RobotModel) -> None:
     folder = run()
     found = logged(folder)
-    assert len(found["/tf"]) == len(passing())
     for state, (stamp, message) in zip(passing(), found["/tf"], strict=True):
         assert stamp == state.stamp_ns
-        assert [each.child_frame_id for each in message.transforms] == list(arm.frame_names)
+        names = [(each.parent_frame_id, each.child_frame_id) for each in message.transforms]
+        assert names == [("world", name) for name in arm.frame_names]
         for each in message.transforms:
             place = [getattr(each.translation, axis) for axis in "xyz"]
             T = transform_from(place, [getattr(each.rotation, axis) for axis in "xyzw"])
-            assert each.parent_frame_id == "world"
             np.testing.assert_allclose(T, arm.frame_pose(state.position, each.child_frame_id), atol=1e-9)
-    meshes = [topic for topic in found if topic.startswith("/arm/")]
     entity = found["/arm/hand"][0][1].entities[0]
-    assert len(meshes) > 5
+    assert len([topic for topic in found if topic.startswith("/arm/")]) > 5
     assert (entity.frame_id, entity.frame_locked) == ("hand", True)
     assert max(entity.triangles[0].indices) < len(entity.triangles[0].points)
     with folder.with_name("out.mcap").open("rb") as stream:
@@ -107,16 +98,14 @@ def test_every_link_is_where_the_robot_has_it_and_our_own_reader_reads_it_too(ru
 
 
 def test_known_space_is_a_grid_of_states_from_its_lower_corner(run: Runs, tmp_path: Path) -> None:
-    spaces = logged(run())["/known_space"]
+    stamp, space = logged(run())["/known_space"][-1]
     grid = open_scene(tmp_path / "scene").snapshots[-1].occupancy()
-    stamp, space = spaces[-1]
     states = grid.states(0.3, 0.7)
     shape = (len(space.data) // space.slice_stride, space.row_count, space.column_count)
     np.testing.assert_array_equal(unpacked(space, NUMBERS)["state"].reshape(shape).T, states)
-    assert (states == VoxelState.FREE).any()
+    assert (states == VoxelState.FREE).any() and stamp == 4 * QUARTER
     corner = [getattr(space.pose.position, axis) for axis in "xyz"]
     np.testing.assert_allclose(corner, grid.origin - grid.voxel / 2)
-    assert stamp == 4 * QUARTER
 
 
 def test_clearances_are_numbers_and_the_verdict_and_events_are_lines(run: Runs) -> None:
@@ -144,19 +133,17 @@ def test_rerun_reads_it_without_an_issue(run: Runs) -> None:
     program = shutil.which("rerun")
     if program is None:
         pytest.skip("no rerun here (800 MB): the file is not opened in it; pip install rerun-sdk")
-    folder = run()
-    logged(folder)
-    out = folder.with_name("out.mcap")
-    assert (
-        "warn"
-        not in subprocess.run([program, "mcap", "check", out], check=True, capture_output=True, text=True).stdout
-    )
-    subprocess.run([program, "mcap", "convert", out, "-o", out.with_suffix(".rrd")], check=True, capture_output=True)
-    shown = subprocess.run(
-        [program, "rrd", "stats", out.with_suffix(".rrd")], check=True, capture_output=True, text=True
-    )
+    logged(folder := run())
+    out, rrd = folder.with_name("out.mcap"), folder.with_name("out.rrd")
+
+    def rerun(*words: object) -> str:
+        return subprocess.run([program, *words], check=True, capture_output=True, text=True).stdout
+
+    assert "warn" not in rerun("mcap", "check", out)
+    rerun("mcap", "convert", out, "-o", rrd)
+    shown = rerun("rrd", "stats", rrd)
     for component in ("Points3D:positions", "Transform3D:translation", "VoxelGridMap:voxel_indices", "TextLog:text"):
-        assert component in shown.stdout
+        assert component in shown
 
 
 def test_without_its_libraries_the_remedy_is_said(run: Runs, monkeypatch: pytest.MonkeyPatch) -> None:

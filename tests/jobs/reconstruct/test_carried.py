@@ -14,7 +14,6 @@ import pytest
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import Config, SceneConfig, load_config
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.formats.scene.scene_writer import SceneWriter
 from splatctrl_cli.geometry import strided_lens
@@ -35,6 +34,7 @@ from tests.jobs.stage import MOVE, Stage, states_on
 from tests.plain import known, plain_grid
 from tests.recording.folder.make_layout import OPENGL_FROM_OPTICAL
 from tests.refused import expect_refusal
+from tests.robot import shapes
 
 CUBE = '<origin xyz="0 0 0.15"/><geometry><box size="0.07 0.07 0.07"/></geometry>'
 HELD = f"<visual>{CUBE}</visual><collision>{CUBE}</collision>"
@@ -56,10 +56,8 @@ class Carrying(FakeSource):
 @pytest.fixture(scope="module")
 def recorded(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Carrying:
     tabletop = plain_arm / "tabletop"
-    urdf = tmp_path_factory.mktemp("carrying") / "robot.urdf"
-    text = (tabletop / "robot.urdf").read_text()
-    assert text.count('<link name="hand">') == 1
-    urdf.write_text(text.replace('<link name="hand">', f'<link name="hand">{HELD}'))
+    before, link, after = (tabletop / "robot.urdf").read_text().partition('<link name="hand">')
+    urdf = shapes.written(tmp_path_factory.mktemp("carrying"), f"{before}{link}{HELD}{after}")
     options = RecordingOptions(duration_s=1.2, width=128, height=96, noise="none", color_rays=0)
     recording = Recording(options, RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml"))
     states = states_on(RAISED + np.linspace(0, 1, 11)[:, None] * MOVE, start_ns=START_NS)
@@ -76,20 +74,18 @@ def stage(desk: Desk, arm: RobotModel, recorded: Carrying) -> Stage:
 
 def declared(folder: Path, *boxes: str) -> Path:
     entries = (f'[[carried]]\nlink = "hand"\nbox = {box}\nstart = 0\nend = 9\n' for box in boxes)
-    path = folder / "declared.toml"
-    path.write_text("".join(entries))
-    return path
+    return shapes.written(folder, "".join(entries), "declared.toml")
 
 
 def mapped(stage: Stage, declare: Path | None, progress: Progress = SILENT) -> JudgedResult:
-    urdf, spheres = Path(stage.desk.robot[1]), Path(stage.desk.robot[3])
-    settings = ["scene.max_splats=3000", "scene.first_iterations=10", "scene.iterations_per_step=3"]
     request = ReconstructRequest(
         source=stage.desk.source,
         out=stage.desk.folder / "scene",
-        config=load_config(None, settings),
-        urdf=urdf,
-        spheres=spheres,
+        config=load_config(
+            None, ["scene.max_splats=3000", "scene.first_iterations=10", "scene.iterations_per_step=3"]
+        ),
+        urdf=Path(stage.desk.robot[1]),
+        spheres=Path(stage.desk.robot[3]),
         declare=declare,
         threads=1,
     )
@@ -99,17 +95,13 @@ def mapped(stage: Stage, declare: Path | None, progress: Progress = SILENT) -> J
 def test_a_box_that_is_declared_is_no_obstacle_and_listed_by_every_verdict(stage: Stage, tmp_path: Path) -> None:
     """The declared box is a centimetre larger than the cube on every side; a second one holds nothing."""
     declare = declared(tmp_path, BOX, "[0.5, 0.5, 0.5, 0.6, 0.6, 0.6]")
-    heard = Said()
-    found = mapped(stage, declare, heard)
-    scene = stage.desk.folder / "scene"
-    code, verdict = stage.judged("--declare", str(declare), scene=scene)
-    assert (code, verdict["label"]) == (0, "safe"), verdict["sentence"]
+    found, scene = mapped(stage, declare, heard := Said()), stage.desk.folder / "scene"
+    verdict = stage.expect(0, {}, "--declare", str(declare), scene=scene, label="safe")
+    words = "hand carries a box from 0 to 9 s: "
     for notes in (found.verdict.notes, verdict["notes"]):
         used, unused = (note for note in notes if "carries a box" in note)
-        assert re.fullmatch(r"hand carries a box from 0 to 9 s: [1-9]\d+ points", used)
-        assert (
-            unused == "hand carries a box from 0 to 9 s: warning: no pixel of any frame needed it; check link and box"
-        )
+        assert re.fullmatch(words + r"[1-9]\d+ points", used)
+        assert unused == words + "warning: no pixel of any frame needed it; check link and box"
     assert [line for line in heard.lines if "[[carried]] 2: no pixel" in line]
     assert not [note for note in verdict["notes"] if "inside the robot" in note]
     _, verdict = stage.judged(scene=scene)
@@ -122,25 +114,18 @@ def test_a_box_that_is_not_declared_is_contact(stage: Stage, tmp_path: Path) -> 
     code, verdict = stage.judged(scene=scene)
     assert (code, verdict["label"]) == (1, "contact")
     code, verdict = stage.judged("--declare", str(declared(tmp_path, BOX)), scene=scene)
-    assert code == 1
-    said = (
-        "hand carries a box: warning: the map was made without this declaration; give reconstruct the same --declare"
-    )
-    assert said in verdict["notes"]
+    said = "the map was made without this declaration; give reconstruct the same --declare"
+    assert code == 1 and f"hand carries a box: warning: {said}" in verdict["notes"]
 
 
 def test_links_that_spheres_stand_for_are_named(stage: Stage, tmp_path: Path) -> None:
-    text = Path(stage.desk.robot[1]).read_text()
-    start = text.index('<link name="hand">')
-    other = tmp_path / "other.urdf"
-    other.write_text(text[:start] + text[start:].replace("<box ", "<cone "))
-    heard = Said()
-    mapped(stage, None, heard)
+    before, link, after = Path(stage.desk.robot[1]).read_text().partition('<link name="hand">')
+    other = shapes.written(tmp_path, before + link + after.replace("<box ", "<cone "), "other.urdf")
+    mapped(stage, None, heard := Said())
     assert not [line for line in heard.lines if "spheres stand for" in line]
     stage.desk.robot[1], stage.desk.folder = str(other), tmp_path / "again"
     mapped(stage, None, heard)
-    said = f"warning: spheres stand for hand: {other}: <cone> cannot be read; correct the URDF"
-    assert said in heard.lines
+    assert f"warning: spheres stand for hand: {other}: <cone> cannot be read; correct the URDF" in heard.lines
 
 
 VOXEL = 0.02  # of 50 x 50 x 50 around the origin, free where x > -0.2, never seen elsewhere
@@ -199,7 +184,6 @@ def test_before_the_first_map_nothing_is_new(tmp_path: Path) -> None:
 
 
 CONFIG = Config(scene=SceneConfig(max_splats=600, first_iterations=20, refine_iterations=20))
-DEPTH_ONLY = {"poses": 1.0, "depths": 1000.0}
 
 
 @pytest.fixture(scope="module")
@@ -220,14 +204,11 @@ def written(folder: Path, views: list[RgbdFrame], *, poses: float, depths: float
     for number, view in enumerate(views):
         T = view.T_world_camera.copy()
         T[:3, 3] *= poses
-        color, depth = folder / f"images/{number:02d}.png", folder / f"images/{number:02d}_depth.png"
-        cv2.imwrite(str(color), view.color[..., ::-1])
-        cv2.imwrite(str(depth), np.round(view.depth * 1e4).astype(np.uint16))
-        files = {name: str(path.relative_to(folder)) for name, path in (("file", color), ("depth_file", depth))}
-        frames.append(
-            {f"{name}_path": path for name, path in files.items()}
-            | {"transform_matrix": (T @ OPENGL_FROM_OPTICAL).tolist()}
-        )
+        color, depth = f"images/{number:02d}.png", f"images/{number:02d}_depth.png"
+        cv2.imwrite(str(folder / color), view.color[..., ::-1])
+        cv2.imwrite(str(folder / depth), np.round(view.depth * 1e4).astype(np.uint16))
+        placed = {"transform_matrix": (T @ OPENGL_FROM_OPTICAL).tolist()}
+        frames.append({"file_path": color, "depth_file_path": depth, **placed})
     k = views[0].intrinsics
     lens = {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx + 0.5, "cy": k.cy + 0.5, "w": k.width, "h": k.height}
     content = {"camera_model": "PINHOLE", "depth_unit_scale_factor": 1e-4 * depths, **lens, "frames": frames, **more}
@@ -254,14 +235,9 @@ def test_another_unit_gives_the_same_map_in_metres_and_is_said(tmp_path: Path, v
         assert name in open_source(folder).loss.notes[0]
 
 
-def refusal(folder: Path, **more: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        made(folder, **more)
-    return str(caught.value)
-
-
 def test_depth_alone_in_another_unit_is_refused_by_its_median(tmp_path: Path, views: list[RgbdFrame]) -> None:
-    assert "is implausible (expected 0.05 to 20 m)" in refusal(written(tmp_path / "set", views, **DEPTH_ONLY))
+    words = "is implausible (expected 0.05 to 20 m)"
+    expect_refusal(words, made, written(tmp_path / "set", views, poses=1.0, depths=1000.0))
 
 
 @pytest.mark.parametrize(
@@ -271,8 +247,7 @@ def test_views_that_meet_in_another_unit_only_are_refused(
     tmp_path: Path, views: list[RgbdFrame], poses: float, depths: float, factor: str
 ) -> None:
     folder = written(tmp_path / "set", views, poses=poses, depths=depths)
-    said = refusal(folder)
-    assert re.search(rf"(do at|multiplied by) {factor}\b", said)
+    said = expect_refusal(rf"(do at|multiplied by) {factor}\b", made, folder)
     unit = re.search(r"give --depth-scale (\S+) \(it is (\S+) m per count\), or correct the poses' unit", said)
     assert float(unit[1]) == pytest.approx(float(unit[2]) * float(factor))
     found = check(CheckRequest(paths=(folder,)))[0].findings
@@ -280,16 +255,13 @@ def test_views_that_meet_in_another_unit_only_are_refused(
 
 
 def test_a_robot_is_in_metres_and_takes_no_guess(tmp_path: Path, views: list[RgbdFrame], plain_arm: Path) -> None:
-    urdf = plain_arm / "tabletop/robot.urdf"
-    said = refusal(written(tmp_path / "set", views, poses=1000.0, depths=1000.0), urdf=urdf)
-    assert "lengths are taken as millimetres" in said
+    folder = written(tmp_path / "set", views, poses=1000.0, depths=1000.0)
+    said = expect_refusal("lengths are taken as millimetres", made, folder, urdf=plain_arm / "tabletop/robot.urdf")
     assert "write poses and depth in metres, or leave the robot out" in said
 
 
 def test_what_has_a_clock_is_in_metres(tmp_path: Path, views: list[RgbdFrame]) -> None:
-    folder = written(tmp_path / "set", views, poses=1000.0, depths=1000.0)
+    written(tmp_path / "set", views, poses=1000.0, depths=1000.0)
     description = 'root = "set"\n[poses]\nformat = "nerfstudio"\nfile = "transforms.json"\naxes = "opengl"\n'
-    path = tmp_path / "set.toml"
-    path.write_text(description + "[stamps]\nrate = 10.0\n")
-    assert folder.is_dir()
+    path = shapes.written(tmp_path, description + "[stamps]\nrate = 10.0\n", "set.toml")
     expect_refusal("is implausible", list, open_source(path).records())

@@ -89,12 +89,10 @@ def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
     shrink_refinement(monkeypatch)
     off = held_out(bent(seven, a_bend(0.05)))
     result = reconstruct(request(off, tmp_path / "scene"))
-    bend = result.metrics["depth_bends"]["camera"]
-    assert result.metrics["depth_bend"] == bend["largest"] > 0.02
+    bend, scene = result.metrics["depth_bends"]["camera"], SceneFolder(tmp_path / "scene")
+    assert result.metrics["depth_bend"] == scene.made_from["depth_bend"] == bend["largest"] > 0.02
     assert bend["residual_after"] < 0.1 * bend["residual_before"]
     assert any("corrected for a bend of at most" in reason.sentence for reason in result.verdict.reasons)
-    scene = SceneFolder(tmp_path / "scene")
-    assert scene.made_from["depth_bend"] == bend["largest"]
     for frame in off:
         if frame.camera != "holdout":
             free = corrected(frame, scene.corrections)
@@ -107,23 +105,22 @@ def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
     seven: list[RgbdFrame], tmp_path: Path, plain_arm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shrink_refinement(monkeypatch)
-    asked = request(bent(seven, a_bend(0.05)), tmp_path / "scene")
-    result = reconstruct(replace(asked, **robot_in(plain_arm)))
-    assert result.metrics["pose_residual"] > 0
-    assert result.metrics["depth_bend"] is None
+    result = reconstruct(replace(request(bent(seven, a_bend(0.05)), tmp_path / "scene"), **robot_in(plain_arm)))
+    assert result.metrics["pose_residual"] > 0 and result.metrics["depth_bend"] is None
     assert "depth_bends" not in result.metrics
 
 
 def test_of_a_camera_that_did_not_train_no_bend_is_known(views: list[RgbdFrame]) -> None:
-    other = replace(views[0], camera="other")
     bend = ViewCorrection(T_world_camera=None, gain=None, bend=a_bend(0.05))
-    known = {(view.camera, view.stamp_ns): bend for view in views[1:]}
-    assert np.array_equal(corrected_among(other, views[1:], known).depth, other.depth)
-    held = replace(other, camera="holdout")
-    assert np.array_equal(corrected_among(held, views[1:], known).depth, unbent(held, a_bend(0.05)).depth)
     rig = [replace(view, camera=f"cam{k % 2}") for k, view in enumerate(views[1:])]
-    of_rig = {(view.camera, view.stamp_ns): bend for view in rig}
-    assert np.array_equal(corrected_among(held, rig, of_rig).depth, held.depth)
+    for camera, trained, is_bent in (
+        ("other", views[1:], False),
+        ("holdout", views[1:], True),
+        ("holdout", rig, False),
+    ):
+        view = replace(views[0], camera=camera)
+        found = corrected_among(view, trained, {(each.camera, each.stamp_ns): bend for each in trained})
+        assert np.array_equal(found.depth, unbent(view, a_bend(0.05)).depth if is_bent else view.depth)
 
 
 def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:
@@ -131,8 +128,7 @@ def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame
     both, none = Corrections(poses=True, exposure=True), Corrections()
     with_, without = (reconstruct(request(right, tmp_path / str(bool(c)), corrections=c)) for c in (both, none))
     assert (with_.out / "splats.ply").read_bytes() == (without.out / "splats.ply").read_bytes()
-    assert without.metrics["pose_residual"] is None
-    assert without.metrics["exposure_spread"] is None
+    assert without.metrics["pose_residual"] is None and without.metrics["exposure_spread"] is None
 
 
 def unlike(views: list[RgbdFrame]) -> list[RgbdFrame]:
@@ -171,13 +167,12 @@ def test_exposures_are_found_where_whole_images_differ_and_no_robot_is_judged(se
         assert is_same != ("exposure_spread" in facts)
         return not is_same
 
+    alike = [exposed(view, np.full(3, 1 + 0.005 * k)) for k, view in enumerate(seven)]
+    bare = [replace(view, depth=np.zeros_like(view.depth)) for view in unlike(seven)]
     assert is_found(unlike(seven))
-    assert not is_found([exposed(view, np.full(3, 1 + 0.005 * k)) for k, view in enumerate(seven)])
-    assert not is_found(unlike(seven), has_clock=True)
-    assert not is_found(unlike(seven), has_robot=True)
-    assert not is_found([replace(view, depth=np.zeros_like(view.depth)) for view in unlike(seven)])
+    assert not any(is_found(views) for views in (alike, bare, glossy(seven)))
+    assert not is_found(unlike(seven), has_clock=True) and not is_found(unlike(seven), has_robot=True)
     assert np.ptp(exposure_gains(glossy(seven))) > 0.1, "whole images seem to differ"
-    assert not is_found(glossy(seven))
 
 
 def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:
@@ -190,9 +185,8 @@ def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_pa
 
 
 def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -> None:
-    expect_refusal(
-        "recorded over time", reconstruct, request(views, tmp_path / "scene", has_clock=True), error=UsageError
-    )
+    timed = request(views, tmp_path / "scene", has_clock=True)
+    expect_refusal("recorded over time", reconstruct, timed, error=UsageError)
     bare = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
     expect_refusal("depth", reconstruct, request(bare, tmp_path / "scene"))
 
@@ -234,7 +228,6 @@ def test_the_verdict_names_the_corrected_cameras_and_holds(metrics: dict[str, An
     rows = metrics["displaced_cameras"]
     reasons = list(calibration(judged(figures={"displaced_cameras": rows})))
     assert all(is_corrected(row) for row in rows.values())
-    assert [(reason.outcome, reason.is_note, reason.who) for reason in reasons] == [
-        (Outcome.PASSED, True, camera) for camera in rows
-    ]
+    told = [(reason.outcome, reason.is_note, reason.who) for reason in reasons]
+    assert told == [(Outcome.PASSED, True, camera) for camera in rows]
     assert "its pose is corrected to within" in reasons[0].sentence

@@ -115,34 +115,32 @@ def test_a_hand_may_touch_what_it_takes_and_leaves_at_its_place_and_no_other_lin
     request_: ReconstructRequest, sample_data: Path
 ) -> None:
     log = sample_data / "tabletop" / "log.mcap"
-    asked = ReplayRequest(log=log, out=request_.out, urdf=request_.urdf, spheres=request_.spheres)
-    bare, source = open_log(asked)
+    bare, source = open_log(ReplayRequest(log=log, out=request_.out, urdf=request_.urdf, spheres=request_.spheres))
     states = read_states(source, bare).states
     first_ns = int(states.stamp_ns[0])
     found = holding(bare)
     part = replace(found.learned[0], start_ns=first_ns + HELD[0], end_ns=first_ns + HELD[1])
-    assert part.words(first_ns) == "panda_hand holds an object from 1.00 to 2.00 s that protrudes by 50 mm"
-    assert replace(part, end_ns=ALWAYS[1]).words(first_ns).startswith("panda_hand holds an object from 1.00 s on")
-    assert replace(part, start_ns=ALWAYS[0]).words(first_ns).startswith("panda_hand holds an object until 2.00 s")
-    assert (
-        replace(part, start_ns=ALWAYS[0], end_ns=ALWAYS[1]).words(0)
-        == "panda_hand has a part that protrudes by 50 mm"
-    )
+    start, end = ALWAYS
+    for each, words in (
+        (part, "panda_hand holds an object from 1.00 to 2.00 s that protrudes by 50 mm"),
+        (replace(part, end_ns=end), "panda_hand holds an object from 1.00 s on that protrudes by 50 mm"),
+        (replace(part, start_ns=start), "panda_hand holds an object until 2.00 s that protrudes by 50 mm"),
+        (replace(part, start_ns=start, end_ns=end), "panda_hand has a part that protrudes by 50 mm"),
+    ):
+        assert each.words(first_ns) == words
     model = bare.join_self_model(replace(found, learned=(part,)))
     contacts = [*grasp_contacts(model, states)]
-    assert {contact.link for contact in contacts} >= {"panda_hand"} and "panda_link0" not in {
-        each.link for each in contacts
-    }
+    links = {contact.link for contact in contacts}
+    assert "panda_hand" in links and "panda_link0" not in links
     taken, left = (
         model.frame_pose(states.position[np.abs(states.stamp_ns - stamp).argmin()], "panda_hand")[:3, 3]
         for stamp in (part.start_ns, part.end_ns)
     )
     assert np.linalg.norm(taken - left) > 0.1
     declared = Declarations(expected_contact=tuple(contacts))
-    times = [(taken, 0.5), (taken, 1.5), (left, 2.5), (taken, 2.5), (left, 1.5), (left, 3.5)]
-    assert [declared.find_expected("panda_hand", place, time) is not None for place, time in times] == [True] * 3 + [
-        False
-    ] * 3
+    expected = [(taken, 0.5), (taken, 1.5), (left, 2.5)], [(taken, 2.5), (left, 1.5), (left, 3.5)]
+    for times, is_expected in zip(expected, (True, False), strict=True):
+        assert {declared.find_expected("panda_hand", *each) is not None for each in times} == {is_expected}
     assert [*grasp_contacts(bare, states)] == []
 
 

@@ -71,8 +71,8 @@ def notes(reconstructed: Reconstructed) -> tuple[Reason, ...]:
 
 def test_a_sound_map_passes_without_a_note() -> None:
     verdict = reconstruct_verdict(made(*STEPS), [])
-    assert verdict.sentence == "reconstruct: PASSED (30 time steps of cam0, cam1, 100 splats)"
-    assert (verdict.shown, verdict.exit_code) == ((), 0)
+    sentence = "reconstruct: PASSED (30 time steps of cam0, cam1, 100 splats)"
+    assert (verdict.sentence, verdict.shown, verdict.exit_code) == (sentence, (), 0)
 
 
 OFF = {
@@ -176,8 +176,13 @@ def test_a_gate_on_a_figure_that_is_not_there_is_not_evaluable_by_name(value: fl
 
 
 def test_a_gate_on_an_unknown_figure_names_the_nearest() -> None:
-    with pytest.raises(UsageError, match="did you mean unrepresented_voxels"):
-        reconstruct_verdict(made(*STEPS), ["unrepresented_voxel<=0"])
+    expect_refusal(
+        "did you mean unrepresented_voxels",
+        reconstruct_verdict,
+        made(*STEPS),
+        ["unrepresented_voxel<=0"],
+        error=UsageError,
+    )
 
 
 def test_a_gate_on_points_inside_a_robot_that_no_pixel_showed_is_not_evaluable() -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatctrl_cli.calibration.evidence import transform_of
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.recordings.provenance import changed_files, differences, first_frame
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, UInt8
@@ -33,10 +34,7 @@ def kept(*frames: RgbdFrame) -> list[dict[str, object]]:
 
 
 def turned(T: Float64, degrees: float) -> Float64:
-    angle = np.radians(degrees)
-    R = np.eye(4)
-    R[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return T @ R
+    return T @ transform_of(np.array([0.0, 0.0, np.radians(degrees), 0.0, 0.0, 0.0]))
 
 
 def test_the_same_recording_differs_in_nothing_nor_does_its_picture_saved_anew() -> None:

@@ -51,16 +51,15 @@ def test_a_shell_in_the_arms_way_changes_no_verdict_and_no_step(stage: Stage, mo
 
 @pytest.mark.parametrize("at", [None, 0.3])
 def test_fields_and_answers_have_the_same_bytes_with_a_shell(stage: Stage, tmp_path: Path, at: float | None) -> None:
-    shell, found = in_the_way(stage), {}
+    shell, found = in_the_way(stage), []
     points = "x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in [*shell.centers, *np.eye(3)])
-    for name in ("bare", "given"):
-        scene = stage.scene(name) if name == "bare" else with_shell(stage.scene(name), shell)
-        baked(scene, tmp_path / f"field_{name}", voxel=0.1, at=at)
-        answers = tmp_path / f"{name}.csv"
+    for scene in (stage.scene("bare"), with_shell(stage.scene("given"), shell)):
+        field, answers = tmp_path / f"field_{scene.name}", tmp_path / f"{scene.name}.csv"
+        baked(scene, field, voxel=0.1, at=at)
         query(QueryRequest(source=scene, points=io.StringIO(points), out=answers, at=at))
-        found[name] = (tmp_path / f"field_{name}" / "field.npz").read_bytes(), answers.read_text()
-    assert found["bare"] == found["given"]
-    rows = [*csv.DictReader(io.StringIO(found["given"][1]))]
+        found.append(((field / "field.npz").read_bytes(), answers.read_text()))
+    assert found[0] == found[1]
+    rows = [*csv.DictReader(io.StringIO(found[1][1]))]
     assert float(rows[0]["distance"]) > 0.1 and rows[1]["observed"] == "never_seen"
 
 
@@ -97,10 +96,10 @@ def test_a_shell_alone_is_refused_wherever_splats_are_taken(
 def test_other_splats_in_the_place_of_a_shell_are_refused(stage: Stage) -> None:
     """As a changed or missing file is, by its digest."""
     scene = stage.scene()
-    stamp_ns = open_scene(scene).snapshots[-1].stamp_ns
-    assert open_scene(scene).shell_at(None) is None and open_scene(scene).shell_at(stamp_ns) is None
+    times = (None, open_scene(scene).snapshots[-1].stamp_ns)
+    assert [open_scene(scene).shell_at(time) for time in times] == [None, None]
     with_shell(scene, in_the_way(stage))
-    assert open_scene(scene).shell_at(None) is not None and open_scene(scene).shell_at(stamp_ns) is not None
+    assert all(open_scene(scene).shell_at(time) is not None for time in times)
     (scene / "shell.ply").write_bytes((scene / "splats.ply").read_bytes())
     expect_refusal(r"shell.ply: was changed after it was written", open_scene(scene).shell_at, None)
     patch_json(scene / "run.json", lambda run: run | {"parts": part_digests(scene)})
@@ -133,12 +132,7 @@ def test_a_score_shows_the_shell_and_keeps_its_depth(tmp_path: Path, monkeypatch
 def test_a_recording_with_a_robot_has_a_shell_and_counts_it_apart(small_recording: Path, tmp_path: Path) -> None:
     fast = ["--max-splats", "400", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4", "-q"]
     log = [str(small_recording / "log.mcap"), "--cameras", "cam1,cam2", *fast]
-    robot = [
-        "--urdf",
-        str(small_recording / "robot.urdf"),
-        "--spheres",
-        str(small_recording / "robot_spheres.yaml"),
-    ]
+    robot = ["--urdf", str(small_recording / "robot.urdf"), "--spheres", str(small_recording / "robot_spheres.yaml")]
     found = {}
     for name, more in (("with", robot), ("without", [*robot, "--set", "scene.shell=0"])):
         assert main(["reconstruct", *log, *more, "-o", str(tmp_path / name)]) == 0

@@ -32,6 +32,7 @@ from splatctrl_cli.voxels import EvidenceClass
 from tests.cli.replay_desk import FakeSource
 
 NUM = 11
+PASSED, FAILED, NOT_EVALUABLE = Outcome.PASSED, Outcome.FAILED, Outcome.NOT_EVALUABLE
 NOTHING_NEAR = {name: np.full((NUM, *shape), np.nan) for name, shape in NEAR_COLUMNS.items()}
 FIVE_STEPS = ReplayTrace(
     stamp_ns=np.arange(5),
@@ -51,6 +52,7 @@ def judged(
     margin: float = 0.02,
     request: Mapping[str, Any] | None = None,
     self_model: Any = None,
+    cameras: Any = None,
     **replay: Any,
 ) -> Judged:
     """A run in which nothing is broken but what is given; figures: of the scene, replay: fields of `Replay`."""
@@ -67,7 +69,7 @@ def judged(
     }
     states = StateColumns(stamp_ns=stamps, position=np.zeros((NUM, 0)), velocity=np.zeros((NUM, 0)))
     scene = KnownScene(
-        at=nothing, observed=None, first_ns=None, cameras=None, digests={}, figures=lambda: figures or {}
+        at=nothing, observed=None, first_ns=None, cameras=cameras, digests={}, figures=lambda: figures or {}
     )
     source, model = FakeSource(states=()), cast("Any", SimpleNamespace(self_model=self_model))
     return Judged(
@@ -88,15 +90,6 @@ def event(kind: EventKind) -> Event:
     return found
 
 
-@pytest.mark.parametrize(("residual", "outcome"), [(4.9, Outcome.PASSED), (5.1, Outcome.NOT_EVALUABLE)])
-def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float, outcome: Outcome) -> None:
-    links = {"hand": {"median_mm": -residual, "sign": -1, "num_pixels": 500}}
-    figures = {"self_mask_residual_mm": residual, "self_mask": links}
-    (reason,) = evidence.calibration(judged(figures=figures))
-    assert reason.outcome is outcome
-    assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
-
-
 def test_a_link_that_holds_a_thing_is_not_judged_by_the_things_surface() -> None:
     seen = {"median_mm": 2.0, "sign": 1, "num_pixels": 5000, "reach_mm": 12.0}
     finger, few = seen | {"median_mm": -9.0, "sign": -1}, seen | {"median_mm": 30.0, "num_pixels": 99}
@@ -110,44 +103,18 @@ def test_a_link_that_holds_a_thing_is_not_judged_by_the_things_surface() -> None
     assert reason.who == "arm"
 
 
-@pytest.mark.parametrize(("sigma", "is_off"), [(0.9, True), (1.1, False)])
-def test_a_camera_that_sees_the_robot_elsewhere_is_no_evidence(sigma: float, is_off: bool) -> None:
-    rows = {
-        "left": {"distance_mm": 6.0, "sigma_mm": sigma, "num_pixels": 2000},
-        "right": {"distance_mm": 0.3, "sigma_mm": 0.2, "num_pixels": 4000},
-    }
-    found = list(evidence.calibration(judged(figures={"displaced_cameras": rows})))
-    assert [(r.outcome, r.who, r.count) for r in found] == [(Outcome.NOT_EVALUABLE, "left", 2000)] * is_off
-
-
 def loop_of(kind: str, metrics: Mapping[str, float], num_near: int = 0) -> Judged:
     """A closed loop with an event; num_near: states with rows relaxed near their margin."""
     columns, happened = {"relaxed_near": np.arange(NUM) < num_near}, (event(EventKind(kind.replace("_", "-"))),)
     return judged(columns, closed_loop=FIVE_STEPS, events=happened, metrics=CONTROLLER | metrics)
 
 
-@pytest.mark.parametrize("what", ["minimum_violation", "hold"])
-def test_a_step_that_is_not_solved_fails_the_controller(what: str) -> None:
-    (reason,) = controller(loop_of(what, {f"num_{what}": 2}))
-    assert reason.outcome is Outcome.FAILED
-    assert f"at 2 of 5 steps (2 {what.replace('_', ' ')})" in reason.sentence
-
-
-def test_a_row_relaxed_within_twice_the_margin_fails_the_controller() -> None:
-    (reason,) = controller(loop_of("relaxed", {"num_relaxed": 3}, num_near=2))
-    assert reason.outcome is Outcome.FAILED
-    assert "at 2 of 5 steps (2 relaxed)" in reason.sentence
-    (passed,) = controller(loop_of("relaxed", {"num_relaxed": 3}))
-    assert passed.outcome is Outcome.PASSED
-    assert passed.sentence == "all 5 steps solved, 3 of them with rows relaxed, all over twice their margin away"
-
-
 @pytest.mark.parametrize(
     ("unknown", "last", "outcome"),
     [
-        ({"fore": "moves too little (3 of 5 configurations)"}, 0.010, Outcome.NOT_EVALUABLE),
-        ({"fore": "moves too little (3 of 5 configurations)"}, 0.021, Outcome.FAILED),
-        ({"upper": "moves too little (3 of 5 configurations)"}, 0.010, Outcome.FAILED),
+        ({"fore": "moves too little (3 of 5 configurations)"}, 0.010, NOT_EVALUABLE),
+        ({"fore": "moves too little (3 of 5 configurations)"}, 0.021, FAILED),
+        ({"upper": "moves too little (3 of 5 configurations)"}, 0.010, FAILED),
     ],
 )
 def test_an_object_always_beside_a_link_that_hardly_moves_may_be_its_part(
@@ -159,7 +126,7 @@ def test_an_object_always_beside_a_link_that_hardly_moves_may_be_its_part(
     known = SimpleNamespace(unknown=unknown)
     (reason,) = clearance(judged(columns, events=(happened,), self_model=known, fields=("exact",)))
     assert reason.outcome is outcome
-    if outcome is Outcome.NOT_EVALUABLE:
+    if outcome is NOT_EVALUABLE:
         assert "a part of fore, which moves too little (3 of 5 configurations)" in reason.sentence
     driven = judged(columns, events=(happened,), self_model=known, fields=("exact",), closed_loop=FIVE_STEPS)
     assert unlearned_link(driven) == (("fore", unknown["fore"]) if "fore" in unknown else None)
@@ -177,37 +144,128 @@ def bodied(deficit: tuple[float, float], surface: float) -> Judged:
     return judged(columns | {"clearance_exact": np.full(NUM, 0.03)}, fields=("exact",), model=model)
 
 
-@pytest.mark.parametrize(("surface", "outcome"), [(0.015, Outcome.NOT_EVALUABLE), (0.025, Outcome.PASSED)])
-def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: float, outcome: Outcome) -> None:
-    (reason,) = surface_clearance(bodied((0.0, 0.005), surface))
-    assert reason.outcome is outcome
+def seen_off(residual: float) -> Judged:
+    """A run whose map's hand is seen so far [mm] from where its joints put it."""
+    links = {"hand": {"median_mm": -residual, "sign": -1, "num_pixels": 500}}
+    return judged(figures={"self_mask_residual_mm": residual, "self_mask": links})
 
 
-def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
-    (reason,) = surface_clearance(bodied((0.0, np.nan), 0.025))
-    assert reason.outcome is Outcome.NOT_EVALUABLE and "is unknown: no meshes" in reason.sentence
+def displaced(sigma: float) -> Judged:
+    """A run of which one camera sees the robot 6 mm off, with this uncertainty [mm], another where it is."""
+    left = {"distance_mm": 6.0, "sigma_mm": sigma, "num_pixels": 2000}
+    right = {"distance_mm": 0.3, "sigma_mm": 0.2, "num_pixels": 4000}
+    return judged(figures={"displaced_cameras": {"left": left, "right": right}})
 
 
-def test_one_state_judged_by_an_old_map_is_enough() -> None:
-    run = judged({"map_age_s": np.array([0.1] * 10 + [1.5])}, events=(event(EventKind.STALE_MAP),))
-    assert outcomes(evidence.map_age, run) == [Outcome.NOT_EVALUABLE]
+def missing(error: float) -> Judged:
+    """A run whose map misses surface by up to `error` [m], 10 cm from the arm."""
+    bound = ConformalBound(bound=error, confidence=0.9, num_stretches=9, length=1, at=0)
+    return judged(map_error=MapError(source="cam3", num_sets=9, num_seen=9, num_points=5, bound=bound, time_s=0.1))
 
 
-def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
-    assert outcomes(evidence.evidence_age, judged({"evidence_age": np.full(NUM, 1.5)})) == [Outcome.NOT_EVALUABLE]
-
-
-def test_a_log_that_ends_with_the_motion_is_not_blamed_for_an_old_map() -> None:
-    (reason,) = evidence.map_age(judged({"map_age_s": np.append(np.full(NUM - 1, 0.1), 1.01)}))
-    assert reason.sentence.startswith("the map is up to 1.01 s old, allowed 1 s (from 1.00 to 1.00 s)")
-
-
-@pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.PASSED), (1.5, Outcome.FAILED)])
-def test_a_joint_may_pass_its_limit_by_the_tolerance(share: float, outcome: Outcome) -> None:
+def past_limit(share: float) -> Judged:
+    """A run past a joint's limit by a share of the tolerance."""
     margin = np.full(NUM, -share * ControlConfig().limit_tolerance)
-    (criterion,) = [one for one in OF_MOTION if one.name == "position limits"]
-    (reason,) = criterion.reasons(judged({"limit_margin": margin, "limit_joint": ["elbow"] * NUM}))
-    assert (reason.outcome, reason.who) == (outcome, "elbow" if outcome is Outcome.FAILED else "")
+    return judged({"limit_margin": margin, "limit_joint": ["elbow"] * NUM})
+
+
+(POSITION_LIMITS,) = (one.reasons for one in OF_MOTION if one.name == "position limits")
+Told = list[tuple[Outcome, str, int | None]]
+CRITERIA: dict[str, tuple[Callable[[Any], Iterator[Reason]], Judged, Told, str]] = {
+    "a robot seen where its joints put it": (evidence.calibration, seen_off(4.9), [(PASSED, "", 1)], ""),
+    "a robot seen off": (evidence.calibration, seen_off(5.1), [(NOT_EVALUABLE, "hand", 500)], ""),
+    "a camera that sees the robot elsewhere": (
+        evidence.calibration,
+        displaced(0.9),
+        [(NOT_EVALUABLE, "left", 2000)],
+        "",
+    ),
+    "a camera that is not sure": (evidence.calibration, displaced(1.1), [], ""),
+    "a step at the minimum violation": (
+        controller,
+        loop_of("minimum_violation", {"num_minimum_violation": 2}),
+        [(FAILED, "", 5)],
+        "constraints could not be satisfied at 2 of 5 steps (2 minimum violation)",
+    ),
+    "a step that holds": (
+        controller,
+        loop_of("hold", {"num_hold": 2}),
+        [(FAILED, "", 5)],
+        "constraints could not be satisfied at 2 of 5 steps (2 hold)",
+    ),
+    "a row relaxed within twice the margin": (
+        controller,
+        loop_of("relaxed", {"num_relaxed": 3}, num_near=2),
+        [(FAILED, "", 5)],
+        "constraints could not be satisfied at 2 of 5 steps (2 relaxed)",
+    ),
+    "a row relaxed farther away": (
+        controller,
+        loop_of("relaxed", {"num_relaxed": 3}),
+        [(PASSED, "", 5)],
+        "all 5 steps solved, 3 of them with rows relaxed, all over twice their margin away",
+    ),
+    "what spheres leave uncovered keeps no margin": (
+        surface_clearance,
+        bodied((0.0, 0.005), 0.015),
+        [(NOT_EVALUABLE, "", NUM)],
+        "",
+    ),
+    "what spheres leave uncovered keeps the margin": (
+        surface_clearance,
+        bodied((0.0, 0.005), 0.025),
+        [(PASSED, "", NUM)],
+        "",
+    ),
+    "one sphere of unknown cover": (
+        surface_clearance,
+        bodied((0.0, np.nan), 0.025),
+        [(NOT_EVALUABLE, "", None)],
+        "the coverage of the robot by its spheres is unknown: no meshes",
+    ),
+    "one state judged by an old map": (
+        evidence.map_age,
+        judged({"map_age_s": np.array([0.1] * 10 + [1.5])}, events=(event(EventKind.STALE_MAP),)),
+        [(NOT_EVALUABLE, "", NUM)],
+        "",
+    ),
+    "a log that ends with the motion": (
+        evidence.map_age,
+        judged({"map_age_s": np.append(np.full(NUM - 1, 0.1), 1.01)}),
+        [(NOT_EVALUABLE, "", NUM)],
+        "the map is up to 1.01 s old, allowed 1 s (from 1.00 to 1.00 s)",
+    ),
+    "old evidence about the arm under a new map": (
+        evidence.evidence_age,
+        judged({"evidence_age": np.full(NUM, 1.5)}),
+        [(NOT_EVALUABLE, "", NUM)],
+        "",
+    ),
+    "a joint past its limit by the tolerance": (POSITION_LIMITS, past_limit(0.5), [(PASSED, "", NUM)], ""),
+    "a joint past its limit by more": (POSITION_LIMITS, past_limit(1.5), [(FAILED, "elbow", NUM)], ""),
+    "a lead-in as long as is allowed": (
+        evidence.judged_time,
+        judged(lead_in_s=0.9 * Config().verdict.lead_in),
+        [],
+        "",
+    ),
+    "a longer lead-in": (
+        evidence.judged_time,
+        judged(lead_in_s=1.1 * Config().verdict.lead_in),
+        [(NOT_EVALUABLE, "", NUM)],
+        "",
+    ),
+    "a surface that keeps the map error": (evidence.map_error, missing(0.09), [(PASSED, "", 5)], ""),
+    "a surface nearer than the map error": (evidence.map_error, missing(0.11), [(NOT_EVALUABLE, "cam3", 5)], ""),
+}
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_a_criterion_gives_its_reason(name: str) -> None:
+    criterion, run, expected, words = CRITERIA[name]
+    found = list(criterion(run))
+    assert [(reason.outcome, reason.who, reason.count) for reason in found] == expected
+    assert all(reason.sentence.startswith(words) for reason in found)
 
 
 def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
@@ -222,24 +280,7 @@ def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
             **dict.fromkeys(("limit_joint", "self_pair"), nowhere),
         )
         (reason,) = evidence.judged_time(judged({"is_blank": audit_columns(part, (), (), ())["is_blank"]}))
-        assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
-
-
-@pytest.mark.parametrize("share", [0.9, 1.1])
-def test_a_lead_in_longer_than_is_allowed_is_not_judged(share: float) -> None:
-    run = judged(lead_in_s=share * Config().verdict.lead_in)
-    assert outcomes(evidence.judged_time, run) == ([Outcome.NOT_EVALUABLE] if share > 1 else [])
-
-
-def test_space_that_was_not_recorded_is_not_known() -> None:
-    assert outcomes(evidence.known_space, judged(metrics={"unknown_share": None})) == [Outcome.NOT_EVALUABLE]
-
-
-@pytest.mark.parametrize(("miss", "outcome"), [(0.09, Outcome.PASSED), (0.11, Outcome.NOT_EVALUABLE)])
-def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome) -> None:
-    bound = ConformalBound(bound=miss, confidence=0.9, num_stretches=9, length=1, at=0)
-    found = MapError(source="cam3", num_sets=9, num_seen=9, num_points=5, bound=bound, time_s=0.1)
-    assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]
+        assert (reason.outcome, reason.time_s) == (NOT_EVALUABLE, pytest.approx(0.3))
 
 
 EVIDENCE = EvidenceClass
@@ -256,8 +297,7 @@ def near_a(kind: EvidenceClass, distance: float) -> dict[str, Any]:
 
 def from_a_surface(column: str, distance: float) -> dict[str, Any]:
     """At one state unseen space is so far [m] from a surface of the map."""
-    near = np.where(np.arange(NUM) == 4, distance, np.inf)
-    return {column: near, f"{column}_place": np.full((NUM, 3), 0.25)}
+    return {column: np.where(np.arange(NUM) == 4, distance, np.inf), f"{column}_place": np.full((NUM, 3), 0.25)}
 
 
 @pytest.mark.parametrize(
@@ -274,49 +314,42 @@ def from_a_surface(column: str, distance: float) -> dict[str, Any]:
 def test_a_place_of_which_too_little_is_known_near_the_arm_is_no_evidence(
     near: Callable[[float], dict[str, Any]], distance: float, count: int
 ) -> None:
-    run = judged(near(distance))
-    found = [r for r in evidence.known_space(run) if r.outcome is Outcome.NOT_EVALUABLE]
-    assert [r.count for r in found] == [1] * count
-    assert not found or (found[0].time_s, found[0].place) == (pytest.approx(0.4), (0.25, 0.25, 0.25))
-    assert not found or f"{1e3 * distance:.1f} mm" in found[0].sentence
+    found = [r for r in evidence.known_space(judged(near(distance))) if r.outcome is NOT_EVALUABLE]
+    told = [(r.count, r.time_s, r.place) for r in found if f"{1e3 * distance:.1f} mm" in r.sentence]
+    assert told == [(1, pytest.approx(0.4), (0.25, 0.25, 0.25))] * count and len(found) == count
 
 
-@pytest.mark.parametrize("kind", STRICT)
-def test_the_arm_in_such_a_place_is_no_evidence_without_a_margin_either(kind: EvidenceClass) -> None:
-    run = judged(near_a(kind, 0.0), margin=0.0)
-    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
-
-
-@pytest.mark.parametrize(("column", "allowed"), [("unseen", evidence.UNSEEN)])
-@pytest.mark.parametrize(("more", "count"), [(-0.01, 0), (0.01, 1)])
-def test_more_that_no_camera_saw_is_no_evidence(column: str, allowed: float, more: float, count: int) -> None:
-    share = np.where(np.arange(NUM) == 4, allowed + more, 0.1)
-    assert outcomes(evidence.known_space, judged({column: share})).count(Outcome.NOT_EVALUABLE) == count
+def unseen(share: float, **given: Any) -> Judged:
+    """A run with a share of the space about the arm that no camera saw, at one state."""
+    return judged({"unseen": np.where(np.arange(NUM) == 4, share, 0.1)}, **given)
 
 
 @pytest.mark.parametrize(
-    ("share", "cameras", "count"),
-    [(0.34, "a", 1), (0.32, "a", 0), (0.39, "ab", 0), (0.41, "ab", 1), (0.47, "abc", 0), (0.47, None, 0)],
+    ("run", "num"),
+    [
+        *((judged(near_a(kind, 0.0), margin=0.0), 1) for kind in STRICT),
+        *((unseen(evidence.UNSEEN - 0.01), 0), (unseen(evidence.UNSEEN + 0.01), 1)),
+        # fewer cameras must see more of it
+        *((unseen(0.34, cameras="a"), 1), (unseen(0.32, cameras="a"), 0)),
+        *((unseen(0.41, cameras="ab"), 1), (unseen(0.39, cameras="ab"), 0)),
+        *((unseen(0.47, cameras="abc"), 0), (unseen(0.47, cameras=None), 0)),
+        # what is not recorded is not known and no proof
+        (judged(metrics={"unknown_share": None}), 1),
+        (judged(near_a(EVIDENCE.FREE, 0.01), request={"require_proof": "occupied"}), 1),
+        (judged(near_a(EVIDENCE.FREE, 0.01), request={"unseen": "occupied"}), 1),
+    ],
 )
-def test_fewer_cameras_must_see_more_of_the_space_about_the_arm(share: float, cameras: Any, count: int) -> None:
-    run = judged({"unseen": np.full(NUM, share)})
-    run = replace(run, inputs=replace(run.inputs, scene=replace(run.inputs.scene, cameras=cameras)))
-    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == count
+def test_space_of_which_too_little_is_known_is_no_evidence(run: Judged, num: int) -> None:
+    assert outcomes(evidence.known_space, run).count(NOT_EVALUABLE) == num
 
 
 @pytest.mark.parametrize("kind", [kind for kind in EvidenceClass if kind not in STRICT])
-@pytest.mark.parametrize(("option", "broken"), [("require_proof", Outcome.NOT_EVALUABLE), ("unseen", Outcome.FAILED)])
+@pytest.mark.parametrize(("option", "broken"), [("require_proof", NOT_EVALUABLE), ("unseen", FAILED)])
 def test_only_free_space_about_the_arm_is_proof(option: str, broken: Outcome, kind: EvidenceClass) -> None:
     columns = near_a(kind, 0.01) | {"assumed": np.zeros(NUM)}
-    assert set(outcomes(evidence.known_space, judged(columns))) == {Outcome.PASSED}
+    assert set(outcomes(evidence.known_space, judged(columns))) == {PASSED}
     run = judged(columns, request={option: "occupied"})
     assert (broken in outcomes(evidence.known_space, run)) == (kind is not EvidenceClass.FREE)
-
-
-@pytest.mark.parametrize("option", ["require_proof", "unseen"])
-def test_what_is_not_recorded_is_no_proof(option: str) -> None:
-    run = judged(near_a(EvidenceClass.FREE, 0.01), request={option: "occupied"})
-    assert outcomes(evidence.known_space, run).count(Outcome.NOT_EVALUABLE) == 1
 
 
 def test_cells_of_a_state_without_a_step_are_empty() -> None:

@@ -72,11 +72,9 @@ def scene(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     desk.source = FilmedSource(states=logged(), frames=showing(MISSES))
 
     def opened(path: Path, options: SourceOptions, joints: object) -> FakeSource:
-        assert isinstance(desk.source, FakeSource)
         names = desk.source.cameras if options.cameras is None else options.cameras
-        for name in names:
-            if name not in desk.source.cameras:
-                raise InputError(f"{path}: no camera {name!r}", remedy="use one of: cam0, cam9")
+        if unknown := set(names) - set(desk.source.cameras):
+            raise InputError(f"{path}: no camera {unknown.pop()!r}", remedy="use one of: cam0, cam9")
         return replace(desk.source, cameras=names)
 
     monkeypatch.setattr(evidence, "open_states", opened)
@@ -84,11 +82,16 @@ def scene(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["--scene", str(folder), *FAR, "-q"]
 
 
-def judged(desk: Desk, scene: list[str], frames: list[RgbdFrame], code: int = 0) -> Any:
+def judged(desk: Desk, scene: list[str], frames: list[RgbdFrame], code: int = 0, *options: str) -> Any:
     """The metrics of an audit that ends with this code, where cam9 recorded these frames."""
     desk.source = FilmedSource(states=logged(), frames=frames)
-    assert desk.replay(*scene, "--evidence", "cam9", "--force", is_judged=True) == code
+    assert desk.replay(*scene, "--evidence", "cam9", "--force", *options, is_judged=True) == code
     return desk.metrics()
+
+
+def view_down(depth: float | Float64, **given: Any) -> list[RgbdFrame]:
+    """The same depth in each tenth of a second."""
+    return [view(k * SECOND // 10, depth, **given) for k in range(11)]
 
 
 def reason(desk: Desk, criterion: str = "map error") -> dict[str, Any]:
@@ -107,48 +110,56 @@ def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) 
 
 
 def test_a_lower_confidence_takes_a_lower_score(desk: Desk, scene: list[str]) -> None:
-    assert desk.replay(*scene, "--evidence", "cam9", "--set", "verdict.confidence=0.5") == 0
-    expected, metrics = conformal_bound(MISSES, 0.5), desk.metrics()
-    assert expected.bound < MISSES.max()
-    assert metrics["map_error_bound"] == pytest.approx(expected.bound, abs=1e-4)
-    assert metrics["map_error_confidence"] == 0.5
+    expected = conformal_bound(MISSES, 0.5)
+    metrics = judged(desk, scene, showing(MISSES), 0, "--set", "verdict.confidence=0.5")
+    found = metrics["map_error_bound"], metrics["map_error_confidence"]
+    assert found == (pytest.approx(expected.bound, abs=1e-4), 0.5) and expected.bound < MISSES.max()
 
 
 def test_a_bound_larger_than_the_clearance_alone_turns_the_verdict(
     desk: Desk, scene: list[str], arm: RobotModel
 ) -> None:
-    least = clearance(arm, START)
-    misses = MISSES.copy()
-    misses[6] = least + 0.02
+    least, misses = clearance(arm, START), MISSES.copy()
     assert desk.replay(*scene, is_judged=True) == 0
-    judged(desk, scene, showing(misses), 5)
-    verdict = desk.verdict()
-    assert verdict["label"] == "not evaluable"
-    (broken,) = [reason for reason in verdict["reasons"] if reason["outcome"] != "passed"]
-    assert (broken["criterion"], broken["time_s"]) == ("map error", pytest.approx(0.6))
-    assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
-    assert broken["value"] == pytest.approx(-0.02, abs=1e-3)
     misses[6] = least - 0.005
     judged(desk, scene, showing(misses))
+    misses[6] = least + 0.02
+    judged(desk, scene, showing(misses), 5)
+    (broken,) = [reason for reason in desk.verdict()["reasons"] if reason["outcome"] != "passed"]
+    assert (broken["criterion"], broken["time_s"]) == ("map error", pytest.approx(0.6))
+    assert broken["place"] == pytest.approx([*BALL[0][:2], BALL[0][2] + BALL[1] + misses[6]], abs=2e-3)
+    assert (broken["value"], desk.verdict()["label"]) == (pytest.approx(-0.02, abs=1e-3), "not evaluable")
 
 
 def test_a_contact_outranks_it(desk: Desk, scene: list[str], arm: RobotModel) -> None:
-    x, y, z = arm.sphere_centers(START)[-1].tolist()
-    splats = splats_of(BALL, ((x, y, z), 0.02))
+    splats = splats_of(BALL, (tuple(arm.sphere_centers(START)[-1].tolist()), 0.02))
     touched = write_scene(desk.folder / "touched", (0, splats), (SECOND, splats))
     assert desk.replay("--scene", str(touched), *scene[2:], "--evidence", "cam9", is_judged=True) == 1
     assert (desk.verdict()["label"], reason(desk)["outcome"]) == ("contact", "not evaluable")
 
 
-def test_without_evidence_the_sentence_says_so_and_a_request_can_ask_for_it(desk: Desk, scene: list[str]) -> None:
+def test_without_evidence_the_sentence_says_so(desk: Desk, scene: list[str]) -> None:
     assert desk.replay(*scene, is_judged=True) == 0 and "map error not measured" in desk.verdict()["sentence"]
     assert {desk.metrics()[f"map_error_{name}"] for name in ("bound", "blocks", "confidence")} == {None}
-    assert desk.replay(*scene, "--require-evidence", out="asked", is_judged=True) == 5
-    assert desk.verdict("asked")["reasons"][0]["criterion"] == "map error"
-    assert desk.replay(*scene, "--require", "map_error_bound<=0.1", out="gate", is_judged=True) == 5
-    given = ["--require-evidence", "--evidence", "cam9"]
-    assert desk.replay(*scene, *given, "--require", "map_error_bound<=0.01", out="given", is_judged=True) == 0
-    assert desk.replay(*scene, *given, "--require", "map_error_bound<=0.005", out="missed", is_judged=True) == 1
+
+
+GIVEN = ("--require-evidence", "--evidence", "cam9", "--require")
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "first"),
+    [
+        (("--require-evidence",), 5, "map error"),
+        (("--require", "map_error_bound<=0.1"), 5, "--require map_error_bound<=0.1"),
+        ((*GIVEN, "map_error_bound<=0.01"), 0, ""),
+        ((*GIVEN, "map_error_bound<=0.005"), 1, "--require map_error_bound<=0.005"),
+    ],
+)
+def test_a_request_can_ask_for_evidence(
+    desk: Desk, scene: list[str], options: tuple[str, ...], code: int, first: str
+) -> None:
+    assert desk.replay(*scene, *options, is_judged=True) == code
+    assert code == 0 or desk.verdict()["reasons"][0]["criterion"] == first
 
 
 def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
@@ -158,8 +169,8 @@ def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
 
 
 def test_only_surface_near_the_motion_and_in_the_judged_time_counts(desk: Desk, scene: list[str]) -> None:
-    frames = [*showing(MISSES), view(2 * SECOND, 0.5), view(-SECOND, 0.5)]
     elsewhere = FROM + np.array([4.0, 4.0, 0.0])
+    frames = [*showing(MISSES), view(2 * SECOND, 0.5), view(-SECOND, 0.5)]
     frames += [view(frame.stamp_ns, 1.0, eye=elsewhere, camera="cam8") for frame in frames]
     desk.source = FilmedSource(states=logged(), frames=frames, cameras=("cam0", "cam8", "cam9"))
     assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
@@ -171,22 +182,24 @@ def test_only_surface_near_the_motion_and_in_the_judged_time_counts(desk: Desk, 
 def test_what_shows_the_robot_is_no_surface_that_the_map_misses(
     desk: Desk, scene: list[str], arm: RobotModel
 ) -> None:
-    centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
-    top = int(np.argmax(centers[:, 2] + radii))
-    eye = centers[top] + [0.0, 0.0, 1.0]
-    on, beside = (
-        [view(k * SECOND // 10, 1.0 - radii[top] - gap, eye=eye) for k in range(11)] for gap in (0.02, 0.05)
-    )
+    center, radius = highest(arm)
+    on, beside = (view_down(1.0 - radius - gap, eye=center + np.array([0.0, 0.0, 1.0])) for gap in (0.02, 0.05))
     judged(desk, scene, on, 5)
     assert "0 of 11 held-out frame sets" in desk.verdict()["sentence"]
     assert judged(desk, scene, beside, 5)["map_error_bound"] > 0.2
 
 
+def highest(arm: RobotModel) -> tuple[Float64, float]:
+    """Centre and radius [m] of the sphere that reaches highest."""
+    centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
+    top = int(np.argmax(centers[:, 2] + radii))
+    return centers[top], float(radii[top])
+
+
 def test_pixels_at_an_edge_of_depth_are_left_out(desk: Desk, scene: list[str]) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] - 0.004)
     depth[:, 3] = 0.7  # flies between two surfaces, 25 cm before the ball
-    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
-    assert metrics["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
+    assert judged(desk, scene, view_down(depth))["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
     assert reason(desk)["count"] == 11 * SIZE[1] * (SIZE[0] - 3)
 
 
@@ -194,20 +207,18 @@ def test_the_largest_miss_of_a_view_counts_and_a_map_that_is_too_fat_misses_noth
     desk: Desk, scene: list[str]
 ) -> None:
     depth = np.full(SIZE[::-1], 1.0 - BALL[1] + 0.002)  # within the ball
-    assert judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])["map_error_bound"] == 0.0
+    assert judged(desk, scene, view_down(depth))["map_error_bound"] == 0.0
     depth[4, 5] = 1.0 - BALL[1] - 0.013
-    metrics = judged(desk, scene, [view(k * SECOND // 10, depth) for k in range(11)])
-    assert metrics["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
+    assert judged(desk, scene, view_down(depth))["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
 
 
 def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
     arm: RobotModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
-    top = int(np.argmax(centers[:, 2] + radii))
-    points = centers[top] + np.array([[0, 0, radii[top] + gap] for gap in (0.0, 0.02, 0.04, 0.14)])
+    center, radius = highest(arm)
+    points = center + np.array([[0, 0, radius + gap] for gap in (0.0, 0.02, 0.04, 0.14)])
     assert len(apart_from_robot(arm, START, points)) == 2
-    monkeypatch.setattr(arm, "sphere_deficit", np.full(len(radii), 0.1))
+    monkeypatch.setattr(arm, "sphere_deficit", np.full(len(arm.sphere_set.radii), 0.1))
     np.testing.assert_array_equal(apart_from_robot(arm, START, points), points[3:])
 
 
@@ -223,7 +234,7 @@ def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
 def test_evidence_that_is_none_is_refused(
     desk: Desk, scene: list[str], options: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frames = [*showing(MISSES), *(view(k * SECOND // 10, 0.0, camera="blind") for k in range(11))]
+    frames = [*showing(MISSES), *view_down(0.0, camera="blind")]
     cameras = ("cam0", "cam9") if said.startswith("no camera") else ("cam0", "cam9", "blind", "empty")
     desk.source = FilmedSource(states=logged(), frames=frames, cameras=cameras)
     assert desk.replay(*scene, *options) == code
@@ -236,13 +247,11 @@ SETTINGS = ["scene.max_splats=400", "scene.first_iterations=5", "scene.iteration
 
 
 def request(recording: Path, out: Path, **given: Any) -> ReplayRequest:
-    options = SourceOptions(cameras=given.pop("cameras", ("cam0", "cam1")))
-    urdf = recording / "robot.urdf"
     return ReplayRequest(
         log=recording / "log.mcap",
-        urdf=urdf,
+        urdf=recording / "robot.urdf",
         out=out,
-        options=options,
+        options=SourceOptions(cameras=("cam0", "cam1")),
         config=load_config(None, SETTINGS),
         lockstep=True,
         threads=1,
@@ -257,9 +266,8 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
     shown = [step.stamp_ns for step in open_evidence(asked, arm).frame_sets()]
     scene = reconstruct_scene(asked, arm, tmp_path, SILENT)
     scene.at(2**62)
-    stamps = {round((stamp - scene.stamps_ns[0]) / 1e9 * 5) for stamp in scene.stamps_ns}
-    assert stamps == {0, 1, 3, 4}
-    assert {round((stamp - scene.stamps_ns[0]) / 1e9 * 5) for stamp in shown} == {2, 5}
+    numbers = [{round((ns - scene.stamps_ns[0]) / 1e9 * 5) for ns in stamps} for stamps in (scene.stamps_ns, shown)]
+    assert numbers == [{0, 1, 3, 4}, {2, 5}]
     scene.finish()
     run = json.loads((tmp_path / "scene" / "run.json").read_text())
     assert (run["metrics"]["held_out_every"], run["metrics"]["time_steps"]) == (3, 4)
@@ -267,14 +275,11 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
 
 def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:
     source = evidence.open_states(recording / "log.mcap", SourceOptions(), ())
-    steps = [s.stamp_ns for s in time_steps(source.records(), source.cameras, has_clock=True)]
+    steps = list(time_steps(source.records(), source.cameras, has_clock=True))
     for every in (2, 3, 5):
-        given = list(time_steps(source.records(), source.cameras, has_clock=True))
-        kept, left = (
-            [s.stamp_ns for s in select_trained(given, every)],
-            [s.stamp_ns for s in select_held_out(given, every)],
-        )
-        assert sorted(kept + left) == steps and not set(kept) & set(left) and left == steps[every - 1 :: every]
+        kept, left = select_trained(steps, every), select_held_out(steps, every)
+        assert [s.stamp_ns for s in left] == [s.stamp_ns for s in steps[every - 1 :: every]]
+        assert [s.stamp_ns for s in kept] == [s.stamp_ns for k, s in enumerate(steps, 1) if k % every]
 
 
 @pytest.mark.parametrize("evidence", ["2", "cam3"])
@@ -282,17 +287,15 @@ def test_a_lockstep_bounds_its_own_map(recording: Path, tmp_path: Path, evidence
     robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     log = ["replay", str(recording / "log.mcap"), *robot, "--threads", "1", "-q", "--report-only", *settings]
-    out = tmp_path / "out"
+    out, again = tmp_path / "out", tmp_path / "again"
     assert main([*log, "--lockstep", "--evidence", evidence, "-o", str(out)]) in (0, 3)
-    metrics = json.loads((out / "summary.json").read_text())["metrics"]
+    assert ("cam3" in json.loads((out / "scene" / "run.json").read_text())["metrics"]["cameras"]) == (evidence == "2")
+    log += ["--scene", str(out / "scene"), "--evidence"]
+    assert main([*log, evidence, "-o", str(again)]) in (0, 3)
+    metrics, same = (json.loads((run / "summary.json").read_text())["metrics"] for run in (out, again))
     assert 0 <= metrics["map_error_bound"] < 0.3 and metrics["map_error_blocks"] >= 2
-    made = json.loads((out / "scene" / "run.json").read_text())["metrics"]
-    assert ("cam3" in made["cameras"]) == (evidence == "2")
-    again = ["--scene", str(out / "scene"), "--evidence", evidence, "-o", str(tmp_path / "again")]
-    assert main([*log, *again]) in (0, 3)
-    same = json.loads((tmp_path / "again" / "summary.json").read_text())["metrics"]
     assert same["map_error_bound"] == metrics["map_error_bound"]
-    assert main([*log, "--scene", str(out / "scene"), "--evidence", "3", "-o", str(tmp_path / "3")]) == 2
+    assert main([*log, "3", "-o", str(tmp_path / "3")]) == 2
 
 
 def test_the_map_of_evidence_is_the_one_that_states_before_it_were_judged_by(desk: Desk, scene: list[str]) -> None:

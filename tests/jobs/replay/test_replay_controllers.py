@@ -6,6 +6,7 @@ import subprocess
 import textwrap
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
 from tests.cli.test_replay_modes import ball_ahead, events, moving
-from tests.jobs.stage import MOVE, QUARTER, Stage, decisive, passing
+from tests.jobs.stage import MOVE, QUARTER, Beside, Stage, decisive, passing
 from tests.refused import expect_refusal
 from tests.robot.test_fingers import ARM, FRANKA, robot
 
@@ -61,10 +62,16 @@ def stage(desk: Desk, arm: RobotModel, monkeypatch: pytest.MonkeyPatch) -> Stage
     return Stage(desk=desk, arm=arm, map_stamps=tuple(i * QUARTER for i in range(16)))
 
 
-def record(desk: Desk, out: str) -> None:
-    """Keep the commands of an earlier replay; steps.csv has nine digits of them."""
-    rows = [[row[f"v_joint{j}"] for j in range(1, 8)] for row in desk.rows(out)]
-    (desk.folder / "recorded.json").write_text(json.dumps([[float(v) for v in row] for row in rows if row[0]]))
+def reason_of(verdict: dict[str, Any], criterion: str = "controller") -> dict[str, Any]:
+    (found,) = [reason for reason in verdict["reasons"] if reason["criterion"] == criterion]
+    return dict(found)
+
+
+def alike(a: str, b: str) -> bool:
+    try:
+        return float(a) == pytest.approx(float(b), abs=1e-5)
+    except ValueError:
+        return a == b
 
 
 @pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
@@ -74,21 +81,19 @@ def test_the_recorded_commands_of_ours_make_the_same_steps(stage: Stage, mode: s
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL, ball_ahead(stage.arm, 0.01))))
     run = ("--scene", str(scene), "-q", "--mode", mode, "--set", "control.max_time=2")
     assert desk.replay(*run, out="ours") == 0
-    record(desk, "ours")
+    ours = desk.rows("ours")
+    rows = [[float(row[f"v_joint{j}"]) for j in range(1, 8)] for row in ours if row["v_joint1"]]  # of nine digits
+    (desk.folder / "recorded.json").write_text(json.dumps(rows))
     assert desk.replay(*run, "--controller", "own:Recorded") == 0
-    ours, theirs = desk.rows("ours"), desk.rows()
-    assert list(ours[0]) == list(theirs[0]) and len(ours) == len(theirs)
+    theirs, metrics, before = desk.rows(), desk.metrics(), desk.metrics("ours")
+    assert list(ours[0]) == list(theirs[0]) and {row["rung"] for row in theirs} == {"outside"}
     unlike = {
         name for our, their in zip(ours, theirs, strict=True) for name in our if not alike(our[name], their[name])
     }
     assert unlike <= {"rung", "scale", "slack", "relaxed", "intervening", "multipliers", "residual", "num_rows"}
-    assert {row["rung"] for row in theirs} == {"outside"}
-    metrics = desk.metrics()
-    assert (
-        set(metrics) == set(metric_scales(mode, ("exact", "barrier"), has_truth=False)) == set(desk.metrics("ours"))
-    )
-    assert metrics["min_clearance"] == pytest.approx(desk.metrics("ours")["min_clearance"], abs=1e-6)
-    assert metrics["intervention_share"] is None and metrics["num_solved"] == 0
+    assert set(metrics) == set(metric_scales(mode, ("exact", "barrier"), has_truth=False)) == set(before)
+    found = [metrics[name] for name in ("min_clearance", "intervention_share", "num_solved")]
+    assert found == [pytest.approx(before["min_clearance"], abs=1e-6), None, 0]
 
 
 @pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
@@ -101,36 +106,26 @@ def test_the_commands_of_the_log_are_judged_as_a_controllers(
     _, verdict = stage.judged(*run, mode=mode)
     assert ", controller recorded" in verdict["scope"]
     for row in stage.desk.rows()[:40]:
-        newest = min(int(float(row["time_s"]) * 10 + 1e-6), 10)
-        assert float(row["v_joint1"]) == pytest.approx(commands[newest][0])
+        assert float(row["v_joint1"]) == pytest.approx(commands[min(int(float(row["time_s"]) * 10 + 1e-6), 10)][0])
     stage.states = passing()
     assert stage.judged(*run, mode=mode, scene=stage.desk.folder / "scene")[0] == 4
     assert "the log has no commanded velocities; name their columns" in capsys.readouterr().err
 
 
-def alike(a: str, b: str) -> bool:
-    try:
-        return float(a) == pytest.approx(float(b), abs=1e-5)
-    except ValueError:
-        return a == b
-
-
 def test_a_controller_that_is_good_is_safe_and_named(stage: Stage) -> None:
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
     stage.states = passing(0.1 * MOVE)
-    code, verdict = stage.judged("--controller", "reach:Reach", "--controller-twice", mode="closed-loop")
-    assert (code, verdict["label"], decisive(verdict)) == (0, "safe", {})
-    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
-    num = stage.desk.metrics()["num_steps"]
-    assert reason["sentence"] == f"all {num} steps answered" and reason["count"] == num
+    options = ("--controller", "reach:Reach", "--controller-twice")
+    verdict = stage.expect(0, {}, *options, mode="closed-loop", label="safe")
+    num, reason = stage.desk.metrics()["num_steps"], reason_of(verdict)
+    assert (reason["sentence"], reason["count"]) == (f"all {num} steps answered", num)
     assert f"{num} states, controller reach:Reach" in verdict["sentence"]
-    about = json.loads((stage.desk.folder / "out" / "summary.json").read_text())["about"]
-    assert about["controller"] == "reach:Reach"
+    assert stage.desk.json("summary.json")["about"]["controller"] == "reach:Reach"
 
 
 def test_a_motion_of_its_own_is_judged_by_every_criterion(stage: Stage) -> None:
     stage.states = passing(0.4 * MOVE)
-    stage.balls = [*stage.balls, stage.ball_at_the_end(0.005)]
+    stage.balls = [*stage.balls, Beside(0.005)]
     code, verdict = stage.judged("--controller", "own:Constant", "--set", "control.max_time=4", mode="closed-loop")
     assert code == 1 and {"clearance", "goal"} <= set(decisive(verdict))
     assert {event["kind"] for event in events(stage.desk)} >= {"below-margin", "row-broken"}
@@ -141,19 +136,19 @@ def test_commands_above_the_velocity_limits_fail(stage: Stage, mode: str) -> Non
     fast = ("--controller", "own:Fast", "--set", "control.max_time=0.2")
     code, verdict = stage.judged(*fast, mode=mode)
     assert (code, decisive(verdict)["velocity limits"]) == (1, "failed")
-    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "velocity limits"]
+    reason = reason_of(verdict, "velocity limits")
     assert reason["value"] == pytest.approx(2.5 / 2.175, abs=1e-3) and "joint1" in reason["sentence"]
 
 
-@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
-def test_one_that_fails_on_the_way_is_named_and_judged_until_then(stage: Stage, mode: str) -> None:
+@pytest.mark.parametrize(("mode", "answers", "states"), [("open-loop", 3, 11), ("closed-loop", 30, 31)])
+def test_one_that_fails_on_the_way_is_named_and_judged_until_then(
+    stage: Stage, mode: str, answers: int, states: int
+) -> None:
     code, verdict = stage.judged("--controller", "own:Raises", mode=mode)
-    assert (code, verdict["label"]) == (1, "controller failed")
-    (reason,) = [reason for reason in verdict["reasons"] if reason["criterion"] == "controller"]
-    num = {"open-loop": 3, "closed-loop": 30}[mode]
-    assert reason["sentence"] == f"crashed: exit status 1: RuntimeError: out of ideas; after {num} answers,"
-    assert reason["time_s"] == pytest.approx(0.3) and reason["count"] == num + 1
-    assert len(stage.desk.rows()) == {"open-loop": 11, "closed-loop": 31}[mode]
+    assert (code, verdict["label"], len(stage.desk.rows())) == (1, "controller failed", states)
+    reason = reason_of(verdict)
+    assert reason["sentence"] == f"crashed: exit status 1: RuntimeError: out of ideas; after {answers} answers,"
+    assert (reason["time_s"], reason["count"]) == (pytest.approx(0.3), answers + 1)
     assert not any("max_detours" in reason["remedy"] for reason in verdict["reasons"])
     assert "answers, at 0.30 s" in verdict["sentence"]
 
@@ -162,7 +157,7 @@ def test_one_that_fails_at_once_is_still_judged(stage: Stage) -> None:
     code, verdict = stage.judged(
         "--controller-command", "sh -c 'read a; echo {\\\"protocol\\\":1}'", mode="closed-loop"
     )
-    assert (code, verdict["label"]) == (1, "controller failed") and len(stage.desk.rows()) == 1
+    assert (code, verdict["label"], len(stage.desk.rows())) == (1, "controller failed", 1)
     assert "ended: exit status 0; after 0 answers, at 0.00 s" in verdict["sentence"]
 
 
@@ -197,18 +192,16 @@ def test_the_examples_drive_alike(stage: Stage) -> None:
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
     moving(stage.desk, 0.4 * MOVE)
     stage.states = stage.desk.source.states
-    stage.balls = [*stage.balls, stage.ball_at_the_end(0.03)]
+    stage.balls = [*stage.balls, Beside(0.03)]
     scene = stage.scene()
-    code, _ = stage.judged("--controller", "reach:Reach", mode="closed-loop", scene=scene)
-    python = stage.desk.rows()
-    assert code == 0 and float(python[-1]["position_error"]) < 0.01
-    code, _ = stage.judged("--controller-command", "./reach", "--controller-twice", mode="closed-loop", scene=scene)
-    assert code == 0
-    assert_same_commands(stage.desk.rows(), python)
-    stage.judged("--controller", "reach:Reach", mode="open-loop", scene=scene)
-    python = stage.desk.rows()
-    stage.judged("--controller-command", "./reach", mode="open-loop", scene=scene)
-    assert_same_commands(stage.desk.rows(), python)
+    in_cpp, in_python = ("--controller-command", "./reach"), ("--controller", "reach:Reach")
+    for mode, more in (("closed-loop", ["--controller-twice"]), ("open-loop", [])):
+        codes = [stage.judged(*in_python, mode=mode, scene=scene)[0]]
+        python = stage.desk.rows()
+        codes.append(stage.judged(*in_cpp, *more, mode=mode, scene=scene)[0])
+        assert_same_commands(stage.desk.rows(), python)
+        if mode == "closed-loop":
+            assert codes == [0, 0] and float(python[-1]["position_error"]) < 0.01
     assert float(python[0]["v_joint1"]) > 0.1  # it goes along with the log
 
 
@@ -255,13 +248,8 @@ def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_fiel
         centers[100:] = centers[0] + random.normal(size=(100, 3)) * 0.03
         radii = random.uniform(0.002, 0.02, 200).astype(np.float32)
         fields = splat_fields(splats_of(*zip(map(tuple, centers), map(float, radii), strict=True)), Config(), 1)  # type: ignore[arg-type]
-        points = np.concatenate(
-            [
-                random.uniform(-3, 3, (500, 3)),
-                centers[100:] + random.normal(size=(100, 3)) * 0.02,
-                centers.astype(float),
-            ]
-        )
+        near, far = centers[100:] + random.normal(size=(100, 3)) * 0.02, random.uniform(-3, 3, (500, 3))
+        points = np.concatenate([far, near, centers.astype(float)])
         gap = np.linalg.norm(points[:, None] - centers.astype(np.float64), axis=2) - radii.astype(np.float64)
         certified = certified_distance(fields)(points)
         assert np.all(certified < gap.min(axis=1)) and np.all(certified > gap.min(axis=1) - 3e-5)

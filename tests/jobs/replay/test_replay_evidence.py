@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.files.output import part_digests, write_json
+from splatctrl_cli.files.output import part_digests
+from splatctrl_cli.formats.grid.npz_grid import read_npz, write_npz
 from splatctrl_cli.formats.splat.splats import read_ply, write_ply
 from splatctrl_cli.records import SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
-from tests.jobs.stage import FAR, Stage, decisive, states_on
+from tests.jobs.stage import FAR, Stage, decisive, patch_json, states_on
 from tests.plain import known
 from tests.recording.log.make_states import states_of, write_mcap
 
@@ -35,10 +36,8 @@ def stage(desk: Desk, arm: RobotModel) -> Stage:
 
 def of_run(scene: Path, **changes: Any) -> None:
     """The scene's run.json with changes of metrics, inputs or parts."""
-    file = scene / "run.json"
-    run = json.loads(file.read_text())
-    run["metrics"] |= changes.pop("metrics", {})
-    file.write_text(json.dumps(run | changes))
+    metrics = changes.pop("metrics", {})
+    patch_json(scene / "run.json", lambda run: run | {"metrics": run["metrics"] | metrics} | changes)
 
 
 def splats_changed(scene: Path, change: Callable[[SplatSet], SplatSet], **comments: str) -> None:
@@ -57,22 +56,15 @@ def moved(splats: SplatSet, scale: float = 1.0, by: float = 0.0) -> SplatSet:
     )
 
 
-def without_digests(scene: Path) -> None:
-    file = scene / "run.json"
-    run = json.loads(file.read_text())
-    del run["parts"]
-    file.write_text(json.dumps(run))
+def rows_of(scene: Path, step: int | None) -> None:
+    """The table of snapshots with its rows in steps of 1 or -1, or without a row."""
+    header, *rows = (scene / "snapshots.csv").read_text().splitlines()
+    (scene / "snapshots.csv").write_text("\n".join([header, *(rows[::step] if step else [])]) + "\n")
 
 
-def emptied(scene: Path) -> None:
-    table = scene / "snapshots.csv"
-    table.write_text(table.read_text().splitlines()[0] + "\n")
-
-
-def reversed_rows(scene: Path) -> None:
-    table = scene / "snapshots.csv"
-    header, *rows = table.read_text().splitlines()
-    table.write_text("\n".join([header, *rows[::-1]]) + "\n")
+def rows_with_digests(scene: Path, step: int | None) -> None:
+    rows_of(scene, step)
+    of_run(scene, parts=part_digests(scene))
 
 
 def test_a_scene_that_belongs_to_its_log_is_safe(stage: Stage) -> None:
@@ -103,7 +95,10 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: of_run(s, inputs={"--perturb pose-error=0.01": "pose-error=0.01"}),
         "was made with --perturb pose-error=0.01, this log is read without one",
     ),
-    "no digests": (without_digests, "an earlier version wrote it"),
+    "no digests": (
+        lambda s: patch_json(s / "run.json", lambda run: {name: run[name] for name in run if name != "parts"}),
+        "an earlier version wrote it",
+    ),
     "millimetres": (lambda s: splats_changed(s, lambda splats: moved(splats, 1e3)), "splats and occupancy disagree"),
     "moved by 3 m": (
         lambda s: splats_changed(s, lambda splats: moved(splats, by=-3)),
@@ -113,7 +108,7 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: splats_changed(s, lambda splats: splats.select(np.arange(len(splats)) == 0)),
         "of 24 occupied voxels are represented",
     ),
-    "no snapshot left": (lambda s: (emptied(s), of_run(s, parts=part_digests(s)))[1], "got only the map of its end"),
+    "no snapshot left": (lambda s: rows_with_digests(s, None), "got only the map of its end"),
 }
 
 
@@ -122,15 +117,14 @@ def test_evidence_of_something_else_is_not_evaluable(stage: Stage, name: str) ->
     change, words = NOT_ITS_OWN[name]
     scene = stage.scene()
     change(scene)
-    code, verdict = stage.judged(scene=scene)
-    assert (code, decisive(verdict)) == (5, {"evidence": "not evaluable"}) and words in verdict["sentence"]
+    stage.expect(5, {"evidence": "not evaluable"}, scene=scene, says=words)
 
 
 REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
-    "snapshots emptied": (emptied, "snapshots.csv: was changed after it was written"),
-    "snapshots reversed": (reversed_rows, "snapshots.csv: was changed after it was written"),
+    "snapshots emptied": (lambda s: rows_of(s, None), "snapshots.csv: was changed after it was written"),
+    "snapshots reversed": (lambda s: rows_of(s, -1), "snapshots.csv: was changed after it was written"),
     "reversed, with digests that fit": (
-        lambda s: (reversed_rows(s), of_run(s, parts=part_digests(s)))[1],
+        lambda s: rows_with_digests(s, -1),
         "expected stamps that ascend",
     ),
     "splats altered": (
@@ -152,9 +146,7 @@ def test_parts_that_were_changed_are_refused_by_name(
     change, words = REFUSED[name]
     scene = stage.scene()
     change(scene)
-    code, verdict = stage.judged(scene=scene)
-    assert (code, verdict) == (4, {})
-    assert words in capsys.readouterr().err
+    assert stage.judged(scene=scene) == (4, {}) and words in capsys.readouterr().err
     assert not list(stage.desk.folder.glob("out*"))
 
 
@@ -181,62 +173,50 @@ def test_a_field_knows_the_robot_that_its_scene_was_told_apart_from(
 
 def test_an_altered_field_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
     field = baked(stage, stage.scene())
-    with np.load(field / "field.npz") as arrays:
-        changed = dict(arrays)
-    name = next(name for name in changed if "bound" in name)
-    changed[name] = changed[name] + 1.0
-    np.savez_compressed(field / "field.npz", **changed)
+    grid = read_npz(field / "field.npz")
+    bound = {name: values + np.float32(1.0) for name, values in grid.channels.items() if "bound" in name}
+    write_npz(field / "field.npz", replace(grid, channels=grid.channels | bound))
     assert stage.replayed("--field", str(field)) == (4, {})
     assert "field.npz: was changed after it was written" in capsys.readouterr().err
 
 
-def test_a_truth_of_another_recording_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
-    scene, truth = stage.scene(), stage.truth(FAR)
-    document = json.loads(truth.read_text())
-    document["clearance"]["distance"][3] -= 0.05
-    write_json(truth, document)
-    assert stage.judged("--truth", str(truth), scene=scene) == (4, {})
-    assert "is of another recording: its clearances differ by up to 50 mm from" in capsys.readouterr().err
-    document["clearance"]["stamps"] = [stamp + 7 for stamp in document["clearance"]["stamps"]]
-    write_json(truth, document)
-    assert stage.judged("--truth", str(truth), scene=scene) == (4, {})
-    assert "the log has none of its 11 stamps" in capsys.readouterr().err
-
-
-def test_a_rounded_truth_is_of_the_recording(stage: Stage) -> None:
-    scene, truth = stage.scene(), stage.truth(FAR)
-    document = json.loads(truth.read_text())
-    document["clearance"]["distance"] = [value + 5e-4 for value in document["clearance"]["distance"]]
-    write_json(truth, document)
-    assert stage.judged("--truth", str(truth), scene=scene)[0] == 0
+@pytest.mark.parametrize(
+    ("off", "late_ns", "code", "words"),
+    [
+        ([0, 0, 0, -0.05] + [0] * 7, 0, 4, "is of another recording: its clearances differ by up to 50 mm from"),
+        ([0] * 11, 7, 4, "the log has none of its 11 stamps"),
+        ([5e-4] * 11, 0, 0, ""),
+    ],
+    ids=["other clearances", "other stamps", "rounded"],
+)
+def test_a_truth_of_another_recording_is_refused_and_a_rounded_one_is_not(
+    stage: Stage, capsys: pytest.CaptureFixture[str], off: list[float], late_ns: int, code: int, words: str
+) -> None:
+    truth = stage.truth(FAR)
+    true = json.loads(truth.read_text())["clearance"]
+    distances = [value + more for value, more in zip(true["distance"], off, strict=True)]
+    changed = true | {"distance": distances, "stamps": [stamp + late_ns for stamp in true["stamps"]]}
+    patch_json(truth, lambda document: document | {"clearance": changed})
+    assert stage.judged("--truth", str(truth))[0] == code
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("away_s", "is_other"), [(0.9, False), (1.1, True)])
 def test_times_of_scene_and_states_may_be_a_second_apart(stage: Stage, away_s: float, is_other: bool) -> None:
-    last = stage.map_stamps[-1]
-    stage.states = states_on(np.tile(START, (3, 1)), start_ns=int(last + away_s * SECOND))
+    stage.states = states_on(np.tile(START, (3, 1)), start_ns=int(stage.map_stamps[-1] + away_s * SECOND))
     _, verdict = stage.judged("--max-map-age", "10")
     assert decisive(verdict).get("evidence") == ("not evaluable" if is_other else None)
     assert not is_other or "are of different times" in str(verdict["reasons"])
 
 
-@pytest.mark.parametrize(("step_ns", "per_stamp"), [(SECOND // 50, 50), (SECOND // 50, 2)])
-def test_states_that_share_stamps_are_missed_not_dropped_in_silence(
-    stage: Stage, step_ns: int, per_stamp: int
-) -> None:
+@pytest.mark.parametrize("per_stamp", [50, 2])
+def test_states_that_share_stamps_are_missed_not_dropped_in_silence(stage: Stage, per_stamp: int) -> None:
     """Stamps in whole seconds, or in pairs."""
     positions = START + np.linspace(0, 1, 101)[:, None] * np.array([0.5, 0, 0, 0, 0, 0, 0])
-    stamps = [SECOND + (i // per_stamp) * per_stamp * step_ns for i in range(101)]
+    stamps = [SECOND + (i // per_stamp) * per_stamp * SECOND // 50 for i in range(101)]
     stage.map_stamps = [SECOND + i * SECOND // 4 for i in range(9)]
-    names = tuple(f"joint{i}" for i in range(1, 8))
-    log = write_mcap(stage.desk.folder / "x.mcap", states_of(positions, names, stamps=stamps))
-    code, verdict = replayed_log(stage, log)
-    assert (code, decisive(verdict)["judged states"]) == (5, "not evaluable")
-    dropped = next(r for r in verdict["reasons"] if r["criterion"] == "judged states")
-    assert dropped["value"] == len(stamps) - len(set(stamps))
-
-
-def replayed_log(stage: Stage, log: Path) -> tuple[int, dict[str, Any]]:
-    out = stage.desk.folder / "out"
-    code = main(["replay", str(log), *stage.desk.robot, "--scene", str(stage.scene()), "-o", str(out), "-q"])
-    return code, stage.desk.verdict()
+    log = write_mcap(stage.desk.folder / "x.mcap", states_of(positions, tuple(JOINTS), stamps=stamps))
+    out, scene = ("-o", str(stage.desk.folder / "out")), ("--scene", str(stage.scene()))
+    assert main(["replay", str(log), *stage.desk.robot, *scene, *out, "-q"]) == 5
+    (dropped,) = (r for r in stage.desk.verdict()["reasons"] if r["criterion"] == "judged states")
+    assert (dropped["outcome"], dropped["value"]) == ("not evaluable", len(stamps) - len(set(stamps)))

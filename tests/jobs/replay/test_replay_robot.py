@@ -3,6 +3,8 @@
 import json
 import re
 from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from splatctrl_cli.jobs.replay import files, state_pass
 from splatctrl_cli.jobs.replay.inputs import MeasuredRobot, doubts_of, measured_robot
 from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.recording.log import state_columns
-from splatctrl_cli.records import Float64, JointState, SphereSet
+from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot import self_margins
 from splatctrl_cli.robot.coverage import refine_triangles
 from splatctrl_cli.robot.link_meshes import read_solids
@@ -25,6 +27,7 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, scene_of, splats_of, write_field, write_scene
 from tests.control.fakes import Balls
+from tests.jobs.stage import MOVE
 from tests.robot.shapes import arm_of, coverage_deficit, l_shape, written
 
 SHORT = 0.012  # [m] taken off every radius
@@ -47,8 +50,8 @@ def with_spheres(desk: Desk, spheres: SphereSet) -> Desk:
     return desk
 
 
-def about(desk: Desk) -> str:
-    return str(json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["coverage"])
+def about(desk: Desk, out: str = "out") -> dict[str, str]:
+    return dict(desk.json("summary.json", out)["about"])
 
 
 def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> float:
@@ -65,42 +68,54 @@ def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> fl
 def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotModel) -> None:
     with_spheres(desk, shrunk(arm.sphere_set))
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
-    report = coverage_deficit(arm.urdf, shrunk(arm.sphere_set))
+    report, told = coverage_deficit(arm.urdf, shrunk(arm.sphere_set)), about(desk)["coverage"]
     assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
-    assert report.worst.link in about(desk)
-    assert f"up to {1e3 * report.worst.deficit.proven:.2f} mm" in about(desk)  # type: ignore[union-attr]
-    assert "where they keep 20 mm the surface keeps" in about(desk)
+    proven = f"up to {1e3 * report.worst.deficit.proven:.2f} mm"  # type: ignore[union-attr]
+    assert all(words in told for words in (report.worst.link, proven, "where they keep 20 mm the surface keeps"))
 
 
-def test_a_link_without_a_sphere_is_named_and_refused_as_a_margin(
-    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+def bare(desk: Desk, arm: RobotModel) -> None:
+    """No sphere on a fixed link, nor on one that moves."""
     links = tuple(link for link in dict.fromkeys(arm.sphere_set.links) if link not in ("link0", "link3"))
     with_spheres(desk, shrunk(arm.sphere_set, links))
-    assert desk.replay("--scene", str(scene), "-q") == 0 and desk.metrics()["coverage_deficit"] is None
-    assert "nothing of link0, link3, which have no sphere" in about(desk)
-    capsys.readouterr()
-    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
-    message = capsys.readouterr().err
-    assert "expected spheres on every link that moves, got none on link3\n" in message.replace(";", "\n")
-    assert "splatctrl robot spheres" in message
 
 
-def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
-    desk: Desk, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    urdf = Path(desk.robot[1])
-    lost = desk.folder / "lost.urdf"
+def unreadable(desk: Desk, arm: RobotModel) -> None:
+    """A collision mesh that is not there."""
     mesh = '<collision><geometry><mesh filename="package://arm/m.stl"/></geometry></collision>'
-    lost.write_text(urdf.read_text().replace('<link name="link1">', f'<link name="link1">{mesh}', 1))
-    desk.robot[1] = str(lost)
-    assert desk.replay("--scene", str(scene), "-q") == 0 and desk.metrics()["coverage_deficit"] is None
-    assert "is not known" in about(desk) and "package://arm/m.stl" in about(desk)
-    capsys.readouterr()
-    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
-    assert "with --packages DIR; or set control.coverage = report" in capsys.readouterr().err
+    text = Path(desk.robot[1]).read_text().replace('<link name="link1">', f'<link name="link1">{mesh}', 1)
+    desk.robot[1] = str(written(desk.folder, text, "lost.urdf"))
+
+
+@pytest.mark.parametrize(
+    ("change", "told", "refusal"),
+    [
+        (
+            bare,
+            "nothing of link0, link3, which have no sphere",
+            r"expected spheres on every link that moves, got none on link3[;\n].*splatctrl robot spheres",
+        ),
+        (
+            unreadable,
+            r"is not known.*package://arm/m\.stl",
+            "with --packages DIR; or set control.coverage = report",
+        ),
+    ],
+)
+def test_what_no_deficit_is_known_of_is_named_and_refused_as_a_margin(
+    desk: Desk,
+    arm: RobotModel,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[Desk, RobotModel], None],
+    told: str,
+    refusal: str,
+) -> None:
+    scene = scene_of(desk, BALL)
+    change(desk, arm)
+    assert desk.replay(*scene, "-q") == 0 and desk.metrics()["coverage_deficit"] is None
+    assert re.search(told, about(desk)["coverage"])
+    assert desk.replay(*scene, "-q", "--force", "--set", "control.coverage=margin") == 4
+    assert re.search(refusal, capsys.readouterr().err, flags=re.DOTALL)
 
 
 def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, plain_arm: Path) -> None:
@@ -133,44 +148,37 @@ def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: 
     tips = arm.sphere_set.centers[mine, 2] + arm.sphere_set.radii[mine]
     ball = (tuple((place @ [*arm.sphere_set.centers[mine][tips.argmax()][:2], tips.max() + 0.06, 1.0])[:3]), 0.05)
     assert desk.replay(*scene_of(desk, ball), "--mode", "closed-loop", "-q") == 0  # type: ignore[arg-type]
-    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["by_surface"]
+    told = about(desk)["by_surface"]
     assert re.fullmatch(r"spheres that keep less than the margin, .* surfaces keep it: [1-9] of hand", told)
     assert desk.metrics()["num_relaxed"] == 0
     field = write_field(desk.folder / "field", ball)  # type: ignore[arg-type]
     assert desk.replay("--field", str(field), "--mode", "closed-loop", "-q", out="grid") == 0
-    assert "by_surface" not in json.loads((desk.folder / "grid" / "summary.json").read_text())["about"]
+    assert "by_surface" not in about(desk, "grid")
 
 
 def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    links = [arm.sphere_set.links[s] for s in arm.self_pairs()[0]]
-    srdf = desk.folder / "arm.srdf"
-    srdf.write_text(
-        f'<robot name="arm"><disable_collisions link1="{links[1]}" link2="{links[0]}" reason="Never"/></robot>'
-    )
-    assert desk.replay("--scene", str(scene), "-q") == 0
-    every = desk.metrics()["num_self_pairs"]
-    assert every == len(arm.self_pairs())
-    gone = sum({arm.sphere_set.links[a], arm.sphere_set.links[b]} == set(links) for a, b in arm.self_pairs())
-    assert desk.replay("--scene", str(scene), "-q", "--force", "--srdf", str(srdf)) == 0
-    assert gone > 0 and desk.metrics()["num_self_pairs"] == every - gone
-    assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
+    scene, pairs = scene_of(desk, BALL), arm.self_pairs()
+    links = [arm.sphere_set.links[s] for s in pairs[0]]
+    disabled = f'<disable_collisions link1="{links[1]}" link2="{links[0]}" reason="Never"/>'
+    srdf = written(desk.folder, f'<robot name="arm">{disabled}</robot>', "arm.srdf")
+    assert desk.replay(*scene, "-q") == 0 and desk.metrics()["num_self_pairs"] == len(pairs)
+    gone = sum({arm.sphere_set.links[a], arm.sphere_set.links[b]} == set(links) for a, b in pairs)
+    assert desk.replay(*scene, "-q", "--force", "--srdf", str(srdf)) == 0
+    assert gone > 0 and desk.metrics()["num_self_pairs"] == len(pairs) - gone
+    assert srdf.name in desk.json("run.json")["inputs"]
 
 
 @pytest.mark.usefixtures("painted")
 def test_an_fr3_is_reminded_of_its_limits_by_position(plain_arm: Path, tmp_path: Path) -> None:
-    tabletop, urdf = plain_arm / "tabletop", tmp_path / "fr3.urdf"
-    urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
-    model = RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml")
-    drive, audit = Namespace(mode="closed-loop"), Namespace(mode="audit")
+    tabletop = plain_arm / "tabletop"
+    text = (tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint')
+    model = RobotModel.from_urdf(written(tmp_path, text, "fr3.urdf"), tabletop / "robot_spheres.yaml")
     robot = MeasuredRobot(model=model, surfaces=None)
-    (doubt,) = doubts_of(drive, robot, ControlConfig())
-    assert "control.velocity_limits = fr3" in doubt
-    assert (
-        doubts_of(drive, robot, ControlConfig(velocity_limits="fr3"))
-        == doubts_of(audit, robot, ControlConfig())
-        == []
-    )
+    doubts = [
+        doubts_of(Namespace(mode=mode), robot, ControlConfig(velocity_limits=limits))
+        for mode, limits in (("closed-loop", "urdf"), ("closed-loop", "fr3"), ("audit", "urdf"))
+    ]
+    assert [len(each) for each in doubts] == [1, 0, 0] and "control.velocity_limits = fr3" in doubts[0][0]
 
 
 def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
@@ -185,17 +193,18 @@ def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
         lines = [line for line in (told.out + told.err).splitlines() if "self-collision margin" in line]
         assert len(lines) == said
     assert desk.replay(*drive, "--mode=closed-loop", *wide) == 0
-    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["self_margins"]
-    assert told.startswith("self-collision margin: 60 mm, or what spheres can keep: ")
-    assert "link5 and link7" in told and told.endswith("whether links touch is judged by their surfaces")
+    assert re.fullmatch(
+        "self-collision margin: 60 mm, or what spheres can keep: .*link5 and link7.*"
+        "whether links touch is judged by their surfaces",
+        about(desk)["self_margins"],
+    )
 
 
 def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_path: Path) -> None:
     mesh = tmp_path / "elsewhere" / "far" / "ell.stl"
     mesh.parent.mkdir(parents=True)
     l_shape().export(mesh)
-    shapes = arm_of('<mesh filename="package://far/ell.stl"/>', '<sphere radius="0.02"/>')
-    urdf = written(tmp_path / "robot", shapes)
+    urdf = written(tmp_path / "robot", arm_of('<mesh filename="package://far/ell.stl"/>', '<sphere radius="0.02"/>'))
     spheres = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
     file = written(tmp_path, spheres_yaml(spheres, ()), "spheres.yaml")
     for packages, missing in (((), ("base",)), ((tmp_path / "elsewhere",), ())):
@@ -211,17 +220,10 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 def test_blocks_of_any_size_give_the_same_files(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, sample_data: Path, mode: str
 ) -> None:
-    move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
-    desk.source.states = [
-        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=13)
-    ]
-    near = ((0.45, 0.1, 0.6), 0.05)
-    scene = write_scene(
-        desk.folder / "scene",
-        (SECOND // 5, splats_of(BALL)),
-        (SECOND // 2, splats_of(BALL, near)),
-        (SECOND, splats_of(BALL)),
-    )
+    desk.source.states = [replace(s, velocity=MOVE) for s in logged(START + MOVE, num=13)]
+    both = splats_of(BALL, ((0.45, 0.1, 0.6), 0.05))
+    snapshots = ((SECOND // 5, splats_of(BALL)), (SECOND // 2, both), (SECOND, splats_of(BALL)))
+    scene = write_scene(desk.folder / "scene", *snapshots)
     document = json.loads((sample_data / "tabletop" / "truth.json").read_text())
     stamps = [state.stamp_ns for state in desk.source.states]
     document["clearance"] |= {"stamps": stamps, "distance": [0.0] * len(stamps)}

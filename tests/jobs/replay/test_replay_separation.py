@@ -13,6 +13,7 @@ from tests.cli.replay_desk import SECOND, START
 from tests.jobs.stage import FAR, MOVE, QUARTER, Stage, ball_beside, passing, resting, unseen_about
 from tests.reference import separation as reference
 
+NEWCOMER = 'who = "newcomer"\nempty_at = 0.0'
 CELL = """
 [person]
 who = "newcomer"
@@ -74,9 +75,9 @@ def test_figures_gate_and_inputs_say_where_they_are_from(stage: Stage) -> None:
     code, verdict = stage.judged(*separation_option(stage), *gates)
     said = [reason["sentence"] for reason in verdict["reasons"] if reason["criterion"].startswith("--require")]
     assert code == 1 and "first at 0.500 s" in said[0] and "time_below_separation is 0.5, required <= 0.3" in said[1]
-    document = stage.desk.json("separation.json")
-    source = {each["symbol"]: (each["value"], each["source"]) for each in document["inputs"]}
-    assert source == {
+    document, metrics = stage.desk.json("separation.json"), stage.desk.metrics()
+    assert document["claim"] == NO_CLAIM
+    assert {each["symbol"]: (each["value"], each["source"]) for each in document["inputs"]} == {
         "person": (None, "declared"),
         "unseen": (None, "assumed"),
         "v_h": (1.6, "assumed"),
@@ -87,9 +88,7 @@ def test_figures_gate_and_inputs_say_where_they_are_from(stage: Stage) -> None:
         "Z_r": (0.005, "assumed"),
     }
     figures = {each["name"]: each["value"] for each in document["figures"]}
-    metrics = stage.desk.metrics()
     assert all(metrics[name] == value for name, value in figures.items() if name != "standstill_below_s")
-    assert document["claim"] == NO_CLAIM
     scales = column(stage, "speed_scale")
     assert scales[:5].tolist() == [1.0] * 5 and figures["standstill_below_s"] == pytest.approx(
         0.1 * np.sum(scales[5:10] == 0)
@@ -105,13 +104,11 @@ def test_a_replay_without_the_option_has_no_separation(stage: Stage) -> None:
 def test_people_are_those_with_a_label_and_the_rest_is_static(stage: Stage) -> None:
     near, far = (ball_beside(stage.arm, START, gap) for gap in (0.1, 0.4))
     stage.states, stage.balls, stage.people = resting(), [near], [far]
-    labelled = CELL.replace('"newcomer"\nempty_at = 0.0', '"labelled"')
-    assert stage.judged(*separation_option(stage, labelled))[0] == 0
+    assert stage.judged(*separation_option(stage, CELL.replace('"newcomer"\nempty_at = 0.0', '"labelled"')))[0] == 0
     assert column(stage, "separation").min() > 0.35
     assert column(stage, "stop_clearance") == pytest.approx(np.full(11, 0.1), abs=1e-3)
     scene = stage.desk.folder / "scene"
-    anything = CELL.replace('who = "newcomer"\nempty_at = 0.0', 'unseen = "ignored"')
-    stage.judged(*separation_option(stage, anything), scene=scene)
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, 'unseen = "ignored"')), scene=scene)
     assert column(stage, "separation") == pytest.approx(np.full(11, 0.1), abs=1e-3)
 
 
@@ -120,8 +117,7 @@ def test_the_stopping_volume_reaches_where_the_arm_would_stop(stage: Stage) -> N
     stage.states = moving_on()
     stage.balls = [FAR, ball_beside(stage.arm, START + 1.15 * MOVE, 0.03)]
     stage.judged(*separation_option(stage))
-    way, last = column(stage, "clearance_exact")[-1], column(stage, "stop_clearance")[-1]
-    assert way > 0.04 and last < 0.03
+    assert column(stage, "stop_clearance")[-1] < 0.03 and column(stage, "clearance_exact")[-1] > 0.04
 
 
 def test_space_never_seen_counts_as_a_person_on_request(stage: Stage) -> None:
@@ -169,9 +165,8 @@ def test_a_baked_field_and_a_single_map_are_refused(stage: Stage, capsys: pytest
 
 def test_a_driven_arm_is_judged_by_its_commands(stage: Stage) -> None:
     stage.balls = [FAR, ball_beside(stage.arm, START, 0.5)]
-    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")), mode="closed-loop")
-    rows = stage.desk.rows()
-    speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in rows])
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, "")), mode="closed-loop")
+    speed = np.array([[float(row[f"v_joint{j}"] or 0) for j in range(1, 8)] for row in stage.desk.rows()])
     assert np.any(speed) and np.all((column(stage, "S_s") > 0) == np.any(speed != 0, axis=1))
 
 
@@ -181,7 +176,7 @@ def test_a_fast_hand_before_a_person_counts_more_than_a_slow_link_that_is_nearer
     behind = arm.sphere_centers(q)[slow] - np.array([arm.sphere_set.radii[slow] + 0.05 + 0.15, 0.0, 0.0])
     ahead = ball_beside(arm, START + 1.3 * MOVE, 0.05)
     stage.states, stage.balls = moving_on(), [FAR, ((behind[0], behind[1], behind[2]), 0.05), ahead]
-    stage.judged(*separation_option(stage, CELL.replace('who = "newcomer"\nempty_at = 0.0', "")))
+    stage.judged(*separation_option(stage, CELL.replace(NEWCOMER, "")))
     apart = column(stage, "separation") - column(stage, "clearance_exact")
     parts = [(row["separation_part"], row["nearest_exact"]) for row in stage.desk.rows()]
     assert apart.max() > 0.01 and any(worst != nearest for worst, nearest in parts)

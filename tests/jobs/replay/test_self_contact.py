@@ -1,6 +1,5 @@
 """Where an arm touches itself is told by its links' surfaces, whatever its spheres say; and a Franka's own."""
 
-import json
 import re
 from dataclasses import replace
 from itertools import pairwise
@@ -66,9 +65,12 @@ def desk_of(
 def judged(desk: Desk, *arguments: str) -> dict[str, Any]:
     """The reason of self-clearance in the verdict of a replay."""
     desk.replay("--scene", str(desk.folder / "scene"), "-q", "--force", *arguments, is_judged=True)
-    verdict = json.loads((desk.folder / "out" / "summary.json").read_text())["verdict"]
-    found = [reason for reason in verdict["reasons"] if reason["criterion"] == "self-clearance"]
-    return found[0] if found else {}
+    return next((reason for reason in desk.verdict()["reasons"] if reason["criterion"] == "self-clearance"), {})
+
+
+def conclusion(found: dict[str, Any]) -> tuple[Any, ...]:
+    """Outcome, label and pair of a reason."""
+    return found["outcome"], found["label"], found["who"]
 
 
 @pytest.mark.parametrize("spheres", [COVERING, FAT, BLIND], ids=["covering", "fat", "blind"])
@@ -77,15 +79,11 @@ def test_an_arm_that_folds_into_itself_is_in_contact_whatever_its_spheres_are(
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED, CROSSED, OPEN)
     found = judged(desk)
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "contact", "block and drum")
+    assert conclusion(found) == ("failed", "contact", "block and drum")
     assert "block and drum overlap by 5.1 mm" in found["sentence"]
     assert desk.metrics()["min_self_clearance"] == pytest.approx(-0.0051, abs=1e-4)
-    (event,) = [
-        one
-        for one in json.loads((tmp_path / "out" / "events.json").read_text())["events"]
-        if one["kind"] == "self-collision"
-    ]
-    assert event["worst_name"] == "block and drum"
+    names = [e["worst_name"] for e in desk.json("events.json")["events"] if e["kind"] == "self-collision"]
+    assert names == ["block and drum"]
 
 
 @pytest.mark.parametrize("spheres", [COVERING, FAT], ids=["covering", "fat"])
@@ -130,17 +128,16 @@ def test_a_lowered_margin_hides_no_contact_of_the_driven_arm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], spheres: SphereSet
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED)
-    found = judged(desk, *DRIVE)
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")]
-    assert len(said) == 1
-    assert "block and drum" in said[0]
+    found, goal_reached = judged(desk, *DRIVE), desk.metrics()["goal_reached"]
+    (said,) = (
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")
+    )
+    assert "block and drum" in said
     if spheres is COVERING:  # its row stops the arm before the block, and the goal in it is not reached
-        assert (found["outcome"], desk.metrics()["goal_reached"]) == ("passed", 0)
-        assert "(their surfaces then" in said[0]
+        assert (found["outcome"], goal_reached, "(their surfaces then" in said) == ("passed", 0, True)
     else:  # no row knows of the blade
-        assert (found["outcome"], found["label"]) == ("failed", "contact")
-        assert desk.metrics()["goal_reached"] == 1
-        assert "(their spheres do not tell when their surfaces meet)" in said[0]
+        assert (found["outcome"], found["label"], goal_reached) == ("failed", "contact", 1)
+        assert "(their spheres do not tell when their surfaces meet)" in said
 
 
 @pytest.mark.parametrize(
@@ -155,7 +152,7 @@ def test_links_apart_in_the_recording_that_a_lowered_margin_lets_come_together_a
     apart = desk_of(tmp_path, monkeypatch, spheres, OPEN, -OPEN, OPEN, urdf=urdf)
     found = judged(apart, *DRIVE, f"--goal-joints={goal}")
     assert (apart.metrics()["goal_reached"], apart.metrics()["num_relaxed"]) == (1, 0)
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
+    assert conclusion(found) == ("failed", "margin broken", "block and drum")
     assert 0 < found["value"] < found["threshold"] == pytest.approx(1e-3 * least, abs=1e-6)
     said = f"were driven to {1e3 * found['value']:.1f} mm apart, recorded {least} mm or more: spheres keep"
     assert said in found["sentence"]
@@ -170,9 +167,8 @@ def test_without_surfaces_spheres_that_a_lowered_margin_lets_come_together_are_n
 ) -> None:
     desk = desk_of(tmp_path, monkeypatch, COVERING, OPEN, -OPEN, OPEN, urdf=LOST)
     found = judged(desk, *DRIVE, "--goal-joints=0.5,1.9")
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
-    assert desk.metrics()["num_relaxed"] == 0
-    assert found["value"] < found["threshold"] - 0.001
+    assert conclusion(found) == ("failed", "margin broken", "block and drum")
+    assert desk.metrics()["num_relaxed"] == 0 and found["value"] < found["threshold"] - 0.001
 
 
 def test_links_that_hardly_any_posture_parts_are_judged_where_the_recording_does(
@@ -183,8 +179,8 @@ def test_links_that_hardly_any_posture_parts_are_judged_where_the_recording_does
     assert judged(desk) == {}
     said = "not judged whether they touch, for they overlap in every posture recorded or sampled: post and bob"
     assert said in capsys.readouterr().out
-    found = judged(desk_of(tmp_path / "out", monkeypatch, POST_SPHERES, out, touching, urdf=POST))
-    assert (found["outcome"], found["label"], found["who"]) == ("failed", "contact", "post and bob")
+    desk = desk_of(tmp_path / "out", monkeypatch, POST_SPHERES, out, touching, urdf=POST)
+    assert conclusion(judged(desk)) == ("failed", "contact", "post and bob")
     assert said not in capsys.readouterr().out
 
 
@@ -193,7 +189,7 @@ def test_without_geometry_spheres_that_overlap_are_a_contact(tmp_path: Path, mon
     written(tmp_path, LOST)
     assert judged(desk)["label"] == "contact"
     assert judged(desk, "--mode", "closed-loop", "--set", "control.max_time=0.2")
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["about"]["self_margins"].count("mm") >= 2
+    assert desk.json("summary.json")["about"]["self_margins"].count("mm") >= 2
 
 
 CONFIG = ControlConfig(solver="daqp", max_time=8.0)
@@ -220,8 +216,7 @@ def fr3(real_data: Path) -> MeasuredRobot:
     urdf = folder / "expanded" / "fr3_hand.urdf"
     quick = FitOptions(max_spheres=64, restarts=1, num_patches=1000, num_candidates=1200)
     spheres = fit_spheres(read_solids(read_urdf(urdf), [folder]), quick)
-    model = RobotModel.from_urdf(urdf, spheres).moved_by([f"fr3_{name}" for name in LOGGED])
-    return measured(model, urdf, folder)
+    return measured(RobotModel.from_urdf(urdf, spheres), "fr3", folder)
 
 
 @pytest.fixture(scope="module")
@@ -229,20 +224,19 @@ def panda(real_data: Path) -> MeasuredRobot:
     """With cuRobo's spheres."""
     urdf = real_data / "vamp_panda/resources/panda/panda.urdf"
     spheres = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
-    model = RobotModel.from_urdf(urdf, spheres).moved_by([f"panda_{name}" for name in LOGGED])
-    return measured(model, urdf, urdf.parent)
+    return measured(RobotModel.from_urdf(urdf, spheres), "panda", urdf.parent)
 
 
-def measured(model: RobotModel, urdf: Path, packages: Path) -> MeasuredRobot:
+def measured(model: RobotModel, name: str, packages: Path) -> MeasuredRobot:
+    urdf = model.urdf.path
     request = ReplayRequest(log=urdf, urdf=urdf, out=urdf, mode="closed-loop", packages=(packages,))
-    return measured_robot(request, model, CONFIG)
+    return measured_robot(request, model.moved_by([f"{name}_{joint}" for joint in LOGGED]), CONFIG)
 
 
 def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONFIG) -> ReplayTrace:
     """The arm is driven over the last 3 s of the log."""
     motion, frame = tabletop.arm_motion(7.0), model.frame_names[-1]
-    goal = model.frame_pose(motion.at(7.0)[0], frame)
-    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=goal, frame=frame)
+    task = ReplayTask(start=motion.at(4.0)[0], T_world_goal=model.frame_pose(motion.at(7.0)[0], frame), frame=frame)
     return closed_loop(model, config, task, lambda _: field)
 
 
@@ -250,9 +244,8 @@ def driven(model: RobotModel, field: Table | Balls, config: ControlConfig = CONF
 def test_the_closed_loop_arrives_with_every_step_solved(name: str, request: pytest.FixtureRequest) -> None:
     robot: MeasuredRobot = request.getfixturevalue(name)
     trace = driven(robot.model, Table())
-    assert trace.outcome is Outcome.GOAL_REACHED
-    assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
-    assert all(step.scale == 1.0 for step in trace.steps)
+    assert (trace.outcome, num_on_rung(trace, Rung.SOLVED)) == (Outcome.GOAL_REACHED, len(trace.steps))
+    assert {step.scale for step in trace.steps} == {1.0}
     q = np.asarray(trace.position)[::20]
     assert robot.surfaces.gaps(q, robot.model.sphere_centers_batch(q), 0.02).min() > 0.02
     assert min(step.clearance for step in trace.steps) > 0.02 - 1e-3
@@ -265,11 +258,8 @@ def test_the_margin_as_asked_for_relaxes_every_step_of_an_fr3(fr3: MeasuredRobot
 
 
 def test_what_the_pairs_of_an_fr3_keep_keeps_their_surfaces_apart(fr3: MeasuredRobot) -> None:
-    kept = {pair.links: pair for pair in fr3.pair_margins}
-    assert set(kept) == {("fr3_link5", "fr3_link7"), ("fr3_link5", "fr3_hand")}
-    for pair in kept.values():
-        assert -0.015 < pair.margin < 0.02
-        assert pair.surface_gap > 0.01
+    assert {pair.links for pair in fr3.pair_margins} == {("fr3_link5", "fr3_link7"), ("fr3_link5", "fr3_hand")}
+    assert all(-0.015 < pair.margin < 0.02 and pair.surface_gap > 0.01 for pair in fr3.pair_margins)
 
 
 # joint6 and joint7 [rad], the sphere gap at least or at most, and whether link5 and link7 touch
@@ -287,8 +277,7 @@ def test_a_panda_touches_itself_where_curobos_spheres_are_apart(panda: MeasuredR
     assert sphere_gap(panda.model, q, "link5", "link7") > 0.015
     assert nearest(panda, q) < 0
     (kept,) = panda.pair_margins
-    assert kept.links == ("panda_link5", "panda_link7")
-    assert kept.surface_gap < 0
+    assert kept.links == ("panda_link5", "panda_link7") and kept.surface_gap < 0
 
 
 def nearest(robot: MeasuredRobot, q: Float64) -> float:

@@ -17,7 +17,7 @@ from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import Balls, OccupancyGrid
 from tests.cli.replay_desk import SECOND, START, clearance, splats_of, write_scene
-from tests.jobs.stage import FAR, Ball, Stage, decisive, resting
+from tests.jobs.stage import FAR, Ball, Beside, Stage, resting
 from tests.recording.log.make_log import messages_of, write_raw
 from tests.reference.unrepresented import unrepresented
 
@@ -37,13 +37,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_both_fields_of_a_replay_know_them_at_every_time(scene: Path, stamp_ns: int) -> None:
     fields = read_splat_scene(scene, Config(), 1).at(stamp_ns)
     assert fields.distances["exact"](POINTS) == pytest.approx([0.3 - RADIUS, 0.15], abs=1e-6)
-    assert fields.barrier.query(POINTS)[0][0] == pytest.approx(0.3 - RADIUS, abs=1e-3)
-    assert fields.barrier.query(POINTS)[0][0] <= 0.3 - RADIUS + 1e-6
+    barrier = fields.barrier.query(POINTS)[0][0]
+    assert barrier == pytest.approx(0.3 - RADIUS, abs=1e-3) and barrier <= 0.3 - RADIUS + 1e-6
     voxel, splat = fields.obstacles(POINTS)
+    assert (splat.label, splat.splat) == ("object", 0)
     assert (voxel.label, voxel.splat, voxel.cell) == (UNREPRESENTED, None, None)
     assert voxel.position == pytest.approx((0.5, 0.0, 0.4 + RADIUS))
     assert str(voxel).startswith("unrepresented voxel at (0.500")
-    assert (splat.label, splat.splat) == ("object", 0)
 
 
 def test_a_persons_voxels_count_as_people() -> None:
@@ -60,14 +60,13 @@ def test_a_persons_voxels_count_as_people() -> None:
 @pytest.mark.parametrize("at", [None, "0"])
 def test_a_baked_field_holds_them_and_says_how_many(scene: Path, tmp_path: Path, at: str | None) -> None:
     box = ["--box=0.3,-0.1,0.3,0.7,0.1,0.9", "--voxel", "0.1", "--set", "field.max_loss=1"]
-    box += ["--channels", "sdf,hard,bound"]
-    when = [] if at is None else ["--at", at]
+    when = ["--channels", "sdf,hard,bound", *([] if at is None else ["--at", at])]
     assert main(["sdf-bake", str(scene), "-o", str(tmp_path / "field"), *box, *when, "-q"]) == 0
     grid = read_npz(tmp_path / "field" / "field.npz")
-    for channel in ("hard", "sdf"):
-        assert grid.channels[channel][2, 1, 4] == pytest.approx(0.3 - RADIUS, abs=1e-3)
-    assert grid.header["unrepresented_voxels"] == 1
-    assert grid.header["splats_used"] == {"object": 1, "robot": 0, "human": 0}
+    values = [grid.channels[channel][2, 1, 4] for channel in ("hard", "sdf")]
+    assert values == pytest.approx([0.3 - RADIUS] * 2, abs=1e-3)
+    used = {"object": 1, "robot": 0, "human": 0}
+    assert (grid.header["unrepresented_voxels"], grid.header["splats_used"]) == (1, used)
     assert json.loads((tmp_path / "field" / "field.json").read_text())["splats_used"]["object"] == 1
 
 
@@ -116,16 +115,19 @@ def test_a_scene_of_an_older_version_has_none(tmp_path: Path, scene: Path) -> No
     assert read_splat_scene(old, Config(), 1).at(0).distances["exact"](POINTS)[0] > 0.6
 
 
-@pytest.mark.parametrize(("human_margin", "code"), [(0.055, 0), (0.065, 1)])
-def test_people_are_kept_at_a_margin_of_their_own(stage: Stage, human_margin: float, code: int) -> None:
-    stage.people = [stage.ball_at_the_end(0.06)]
-    found, verdict = stage.judged("--set", f"control.human_margin={human_margin}")
-    assert (found, decisive(verdict)) == (code, {"clearance of people": "failed"} if code else {})
-
-
-def test_things_are_not_kept_at_the_margin_of_people(stage: Stage) -> None:
-    stage.balls = [FAR, stage.ball_at_the_end(0.06)]
-    assert stage.judged("--set", "control.human_margin=0.1")[0] == 0
+@pytest.mark.parametrize(
+    ("kind", "human_margin", "broken"),
+    [
+        ("people", 0.055, {}),
+        ("people", 0.065, {"clearance of people": "failed"}),
+        ("balls", 0.1, {}),
+    ],
+)
+def test_people_and_no_things_are_kept_at_a_margin_of_their_own(
+    stage: Stage, kind: str, human_margin: float, broken: dict[str, str]
+) -> None:
+    setattr(stage, kind, [FAR, Beside(0.06)])
+    stage.expect(int(bool(broken)), broken, "--set", f"control.human_margin={human_margin}")
 
 
 def test_the_truth_is_that_of_the_nearest_surface_not_of_the_nearest_centre(stage: Stage, arm: RobotModel) -> None:

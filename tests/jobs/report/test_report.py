@@ -40,27 +40,31 @@ def reported(path: Path, **more: Any) -> str:
     return out.read_text()
 
 
+def shown(path: Path, script: str) -> dict[str, Any]:
+    """What a script found on the page of a run or batch, which complains of nothing."""
+    reported(path)
+    found = found_on(path.with_name("page.html"), f"{OPENED} {script}" if "while" not in script else script)
+    assert found.pop("complaints") == []
+    return found
+
+
 def test_a_report_says_the_verdict_first_and_holds_everything_itself(run: Runs) -> None:
     folder = run()
-    page = reported(folder)
-    sentence = json.loads((folder / "run.json").read_text())["verdict"]["sentence"]
-    body = page[page.index("<body>") :]
-    assert "MARGIN BROKEN" in sentence
+    page, run_json = reported(folder), json.loads((folder / "run.json").read_text())
+    sentence, body = run_json["verdict"]["sentence"], page[page.index("<body>") :]
     assert body.index(sentence.split(":")[0]) < body.index("<table") < body.index('<svg class="timeline"')
-    assert "data:image/jpeg;base64," in page
-    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
-    assert "replay fake.mcap --scene scene" in page
-    assert len(page) < 2_000_000
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page) and len(page) < 2_000_000
+    assert "MARGIN BROKEN" in sentence
+    assert all(words in page for words in ("data:image/jpeg;base64,", "replay fake.mcap --scene scene"))
 
 
 def test_the_scene_of_a_replay_is_the_one_known_at_each_time(run: Runs, arm: RobotModel) -> None:
     space = space_of(run())
-    assert list(map(len, space.splats.values())) == [1, 1, 2, 2, 2]
-    assert list(space.splats) == [0.0, 0.25, 0.5, 0.75, 1.0]
+    num_splats = {seconds: len(splats) for seconds, splats in space.splats.items()}
+    assert num_splats == {0.0: 1, 0.25: 1, 0.5: 2, 0.75: 2, 1.0: 2}
     worst = int(np.argmin(space.motion.clearance))
     np.testing.assert_allclose(space.motion.path[worst], arm.frame_pose(passing()[worst].position, "hand")[:3, 3])
-    deciding = space.deciding
-    gap = np.linalg.norm(np.subtract(deciding["center"], deciding["place"])) - deciding["radius"]
+    gap = np.linalg.norm(np.subtract(space.deciding["center"], space.deciding["place"])) - space.deciding["radius"]
     assert gap == pytest.approx(0.012, abs=1e-4)
 
 
@@ -74,8 +78,7 @@ def test_a_scene_opens_at_its_first_camera_and_has_a_menu_of_all(stage: Stage, t
         }
         for name, eye in eyes.items()
     ]
-    metrics = {"cameras": [*eyes], "has_clock": True, "stamp_ns": 0, "first_frames": frames}
-    scene = replace(stage, run={"command": "reconstruct", "arguments": [], "metrics": metrics}).scene()
+    scene = replace(stage, metrics={"cameras": [*eyes], "stamp_ns": 0, "first_frames": frames}).scene()
     side = space_of(scene).cameras[1]
     assert (side["name"], side["eye"], side["fov"]) == ("side", eyes["side"], pytest.approx(90.0))
     np.testing.assert_allclose(side["ahead"], np.array([0.0, -1.0, -0.2]) / np.hypot(1.0, 0.2))
@@ -85,17 +88,14 @@ def test_a_scene_opens_at_its_first_camera_and_has_a_menu_of_all(stage: Stage, t
       found.front = place(); menu.value = 1; menu.onchange(); found.side = place(); found.fov = viewer.camera.fov;
       found.ahead = viewer.target.clone().sub(viewer.camera.position).normalize().toArray();"""
     found = found_on(page, script)
-    assert found["complaints"] == []
-    assert found["names"] == ["view from", "front", "side"]
+    assert (found["complaints"], found["names"]) == ([], ["view from", "front", "side"])
     np.testing.assert_allclose([found["front"], found["side"]], [*eyes.values()], atol=1e-6)
-    np.testing.assert_allclose(found["ahead"], side["ahead"], atol=1e-6)
-    assert found["fov"] == pytest.approx(90.0)
+    np.testing.assert_allclose([*found["ahead"], found["fov"]], [*side["ahead"], 90.0], atol=1e-6)
 
 
 def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> None:
     folder = run()
-    reported(folder)
-    script = f"""{OPENED} {ARM}
+    script = f"""{ARM}
       viewer.slider.value = 0; viewer.slider.oninput(); found.first = arm();
       const shown = () => viewer.sets.map((set) => set.nodes[0].visible);
       found.early = shown();
@@ -103,30 +103,26 @@ def test_the_slider_moves_the_arm_and_shows_what_was_known_then(run: Runs) -> No
       found.late = shown(); found.words = viewer.words.textContent;
       await wait(300); const pixels = new Uint8Array(4 * 90000), gl = viewer.renderer.getContext(); viewer.paint();
       gl.readPixels(0, 0, 300, 300, gl.RGBA, gl.UNSIGNED_BYTE, pixels); found.shades = new Set(pixels).size;"""
-    found = found_on(folder.with_name("page.html"), script)
-    assert found["complaints"] == []
-    motion = space_of(folder).motion
-    for shown, poses in ((found["first"], motion.poses[0]), (found["last"], motion.poses[-1])):
-        drawn = [transform_from(link[:3], link[3:]) for link in shown]
+    found, motion = shown(folder, script), space_of(folder).motion
+    for name, poses in (("first", motion.poses[0]), ("last", motion.poses[-1])):
+        drawn = [transform_from(link[:3], link[3:]) for link in found[name]]
         np.testing.assert_allclose(drawn, poses, atol=2e-4)
     assert np.abs(np.array(found["first"])[:, :3] - np.array(found["last"])[:, :3]).max() > 0.05
     assert (found["early"], found["late"]) == ([True, *4 * [False]], [*4 * [False], True])
-    assert found["words"].startswith("1.00 s, ")
-    assert found["shades"] > 10
+    assert found["words"].startswith("1.00 s, ") and found["shades"] > 10
 
 
 def test_a_click_in_the_timeline_moves_the_arm_and_the_pointer_reads_values(run: Runs) -> None:
     folder = run(mode="closed-loop")
     assert "QP rung" in reported(folder)
-    script = f"""{OPENED}
+    script = """
       const line = document.querySelector(".timeline"), box = line.getBoundingClientRect();
-      const at = {{clientX: box.left + 0.5 * box.width, clientY: box.top + 50, bubbles: true}};
+      const at = {clientX: box.left + 0.5 * box.width, clientY: box.top + 50, bubbles: true};
       line.dispatchEvent(new MouseEvent("click", at));
       found.state = +viewer.slider.value; found.most = +viewer.slider.max;
       line.dispatchEvent(new PointerEvent("pointermove", at));
       found.words = line.parentElement.querySelector(".hover").textContent;"""
-    found = found_on(folder.with_name("page.html"), script)
-    assert found["complaints"] == []
+    found = shown(folder, script)
     assert 0.3 < found["state"] / found["most"] < 0.7
     assert re.fullmatch(r"\d+\.\d\d s; to the splats -?[\d.]+ mm; the controller's field -?[\d.]+ mm", found["words"])
 
@@ -145,8 +141,7 @@ def test_texts_of_a_run_are_no_markup(run: Runs) -> None:
     folder = run()
     bad = "</script><script>alert(1)</script>"
     patch_json(folder / "run.json", lambda f: f | {"verdict": {**f["verdict"], "sentence": bad}, "seed": bad})
-    events = folder / "events.json"
-    patch_json(events, lambda f: {"events": [{**event, "kind": bad} for event in f["events"]]})
+    patch_json(folder / "events.json", lambda f: {"events": [{**event, "kind": bad} for event in f["events"]]})
     patch_json(folder / "run.json", lambda found: found | {"parts": part_digests(folder)})
     assert "alert(1)</script>" not in reported(folder)
 
@@ -183,24 +178,22 @@ def test_a_report_is_not_replaced_without_force_and_a_run_without_anything_to_se
 def batch(run: Runs, tmp_path: Path) -> Path:
     """Ten recordings with an audit each, of which the third is not as expected, and the fourth has an error."""
     folder, audit = tmp_path / "batch", run()
+    verdict = json.loads((audit / "run.json").read_text())["verdict"]
+    judged = {key: verdict[key] for key in ("outcome", "label", "sentence", "exit_code")}
+    ends = {
+        2: judged | {"state": "failed", "expect": "passed"},
+        3: {"state": "error", "cause": "timed out after 600 s"},
+    }
     nodes = []
     for number in range(10):
-        place = folder / f"rec{number}"
-        place.mkdir(parents=True)
-        (place / "audit.log").write_text(f"a line of {number}\n")
-        node = {"id": f"rec{number}/audit", "recording": f"rec{number}", "job": "audit", "command": "replay"}
-        node |= {"out": f"rec{number}/audit", "log": f"rec{number}/audit.log", "expect": "failed", "new": "later"}
-        node |= {"result": f"rec{number}/audit.json"}
-        if number == 3:
-            nodes.append(node | {"state": "error", "cause": "timed out after 600 s"})
-            continue
-        (place / "audit").mkdir()
-        for file in audit.iterdir():
-            (place / "audit" / file.name).write_bytes(file.read_bytes())
-        verdict = json.loads((audit / "run.json").read_text())["verdict"]
-        node |= {key: verdict[key] for key in ("outcome", "label", "sentence", "exit_code")}
-        state = "failed" if number == 2 else "done"
-        nodes.append(node | {"state": state, "expect": "passed" if number == 2 else "failed"})
+        out = f"rec{number}/audit"
+        (folder / out).parent.mkdir(parents=True)
+        (folder / f"{out}.log").write_text(f"a line of {number}\n")
+        node = {"id": out, "recording": f"rec{number}", "job": "audit", "command": "replay", "new": "later"}
+        node |= {"out": out, "log": f"{out}.log", "result": f"{out}.json", "expect": "failed"}
+        nodes.append(node | ends.get(number, judged | {"state": "done"}))
+        if number != 3:
+            shutil.copytree(audit, folder / out)
     document = {"format": "splatctrl-batch", "version": 1, "suite": "desk", "jobs": ["audit"], "nodes": nodes}
     (folder / "batch.json").write_text(json.dumps(document))
     return folder
@@ -211,35 +204,27 @@ def before(batch: Path, tmp_path: Path) -> Path:
     """The batch as it was before the seventh replay came nearer, and the eighth kept further off."""
     shutil.copytree(batch, tmp_path / "before")
     for number, clearance in ((7, -0.9), (8, 0.9)):
-        metrics = {"min_clearance": clearance}
-        patch_json(
-            batch / f"rec{number}/audit/run.json", lambda run, new=metrics: run | {"metrics": run["metrics"] | new}
-        )
+        path, metrics = batch / f"rec{number}/audit/run.json", {"min_clearance": clearance}
+        patch_json(path, lambda run, new=metrics: run | {"metrics": run["metrics"] | new})
     return tmp_path / "before"
 
 
 def test_a_batch_begins_with_what_is_not_as_expected(batch: Path, before: Path) -> None:
     page = reported(batch, against=before)
-    sections = re.findall(r'<section id="([^"]+)"', page)
-    assert sections[:3] == ["rec2/audit", "rec3/audit", "rec7/audit"]
-    assert len(sections) == 10
-    assert "2 of 10 jobs not as expected; first rec2/audit: replay: MARGIN BROKEN" in page
-    assert "timed out after 600 s" in page
-    assert "a line of 3" in page
-    assert len(re.findall(r'data-scene="', page)) == MOST_SCENES
-    assert len(re.findall(r'data-scene="', reported(batch, all_scenes=True))) == 9
-    assert page.count("The value of each curve") == 1
+    sections, scenes = re.findall(r'<section id="([^"]+)"', page), r'data-scene="'
+    assert (sections[:3], len(sections)) == (["rec2/audit", "rec3/audit", "rec7/audit"], 10)
+    first = "2 of 10 jobs not as expected; first rec2/audit: replay: MARGIN BROKEN"
+    assert all(words in page for words in (first, "timed out after 600 s", "a line of 3"))
+    assert page.count("The value of each curve") == 1 and len(re.findall(scenes, page)) == MOST_SCENES
+    assert len(re.findall(scenes, reported(batch, all_scenes=True))) == 9
 
 
 def test_a_scene_of_a_batch_opens_when_it_is_asked_for_and_closes_the_other(batch: Path) -> None:
-    reported(batch)
     script = """const buttons = [...document.querySelectorAll("button.open")];
       const spaces = [...document.querySelectorAll(".space")];
       for (const k of [0, 1]) { buttons[k].click(); while (!spaces[k].viewer) await wait(50); }
       found.canvases = spaces.map((space) => space.querySelectorAll("canvas").length);"""
-    found = found_on(batch.with_name("page.html"), script)
-    assert found["complaints"] == []
-    assert found["canvases"] == [0, 1, 0, 0, 0, 0]
+    assert shown(batch, script) == {"canvases": [0, 1, 0, 0, 0, 0]}
 
 
 @pytest.mark.parametrize(
@@ -263,7 +248,13 @@ def test_a_job_that_leads_out_of_its_batch_is_not_read(batch: Path) -> None:
 def test_a_report_says_what_changed_since_a_batch_or_a_baseline(batch: Path, before: Path, tmp_path: Path) -> None:
     for folder in (batch, before):  # as few recordings as are judged one by one
         patch_json(folder / "batch.json", lambda f: f | {"nodes": [f["nodes"][k] for k in (2, 7, 8)]})
-    patch_json(batch / "batch.json", lambda f: f | {"nodes": [_as_expected(node) for node in f["nodes"]]})
+    as_expected = {"failed": "done"}
+    patch_json(
+        batch / "batch.json",
+        lambda f: (
+            f | {"nodes": [node | {"state": as_expected.get(node["state"], node["state"])} for node in f["nodes"]]}
+        ),
+    )
     page = reported(batch, against=before)
     table, better = page[page.index("What changed") : page.index("<h2>Recordings")].split("<details>")
     assert re.findall(r'href="#([^"]+)"', table) == ["rec2/audit", "rec7/audit"]
@@ -276,21 +267,15 @@ def test_a_report_says_what_changed_since_a_batch_or_a_baseline(batch: Path, bef
 
 def test_a_report_says_that_nothing_changed(run: Runs) -> None:
     folder = run()
-    page = reported(folder, against=folder)
-    start = page.index("What changed")
-    assert "NO REGRESSION" in page[start : start + 200] and page.count("<h2>What changed") == 1
-
-
-def _as_expected(node: dict[str, Any]) -> dict[str, Any]:
-    return node | {"state": "done"} if node["state"] == "failed" else node
+    (changed,) = reported(folder, against=folder).split("<h2>What changed")[1:]
+    assert "NO REGRESSION" in changed[:200]
 
 
 def added(batch: Path, *nodes: dict[str, Any]) -> str:
     """The page of a batch with these nodes, too, which are named by recording and job."""
-    more = [
-        {"recording": node["id"].split("/")[0], "job": node["id"].split("/")[1].partition("+")[0]} | node
-        for node in nodes
-    ]
+    parts = [node["id"].split("/") for node in nodes]
+    names = [{"recording": recording, "job": job.partition("+")[0]} for recording, job in parts]
+    more = [name | node for name, node in zip(names, nodes, strict=True)]
     patch_json(batch / "batch.json", lambda found: found | {"nodes": [*found["nodes"], *more]})
     return reported(batch)
 
@@ -310,8 +295,8 @@ def test_many_recordings_are_folded_and_an_expected_error_is_said(batch: Path) -
     page = added(batch, *more, {"id": "bag0/scene", "state": "skipped", "cause": "needs it"})
     first, _, rest = page[page.index("<h2>Recordings") :].partition("<summary>20 more recordings</summary>")
     assert (first.count("<tr"), rest.count(">exit 4, as expected<")) == (41, 20)
-    assert "bag0/scene" in page and 'id="bag0/scene"' not in page, "what did not run has no section"
-    assert 'href="#bag0/scene"' not in page
+    found = [words in page for words in ("bag0/scene", 'id="bag0/scene"', 'href="#bag0/scene"')]
+    assert found == [True, False, False], "what did not run has no section"
 
 
 def test_recordings_as_expected_have_a_picture(batch: Path) -> None:
@@ -322,11 +307,10 @@ def test_recordings_as_expected_have_a_picture(batch: Path) -> None:
         cv2.imwrite(str(folder / f"{name}.png"), np.zeros((40, 900, 3), np.uint8))
         run = {"command": kind, "splatctrl": "0.2.0", "parts": part_digests(folder)}
         (folder / "run.json").write_text(json.dumps(run))
-        done = {"state": "done", "outcome": "passed", "label": "passed"}
-        nodes.append({"id": f"other{number}/job", "command": kind, "out": f"other{number}/job", **done})
-    page = added(batch, *nodes)
-    shown = page[page.index("Pictures of other recordings") :]
-    assert re.findall(r"<figcaption>([^:]+):", shown) == ["other0/job", "other1/job"]
+        done = {"state": "done", "outcome": "passed", "label": "passed", "command": kind}
+        nodes.append({"id": f"other{number}/job", "out": f"other{number}/job", **done})
+    _, _, pictures = added(batch, *nodes).partition("Pictures of other recordings")
+    assert re.findall(r"<figcaption>([^:]+):", pictures) == ["other0/job", "other1/job"]
 
 
 def test_a_report_against_what_cannot_be_compared_is_refused(run: Runs, batch: Path, tmp_path: Path) -> None:

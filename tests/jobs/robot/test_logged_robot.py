@@ -1,5 +1,6 @@
 """The robot that a log describes itself stands in for --urdf, and a model that differs from it is said."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -71,11 +72,10 @@ def as_parameter(text: str, kind: int = 4) -> RawMessage:
         **{"bool_array_value": np.zeros(0, bool), "string_array_value": []},
     }
     value = T["rcl_interfaces/msg/ParameterValue"](**fields)
-    parameter = T["rcl_interfaces/msg/Parameter"](name="robot_description", value=value)
     event = T["rcl_interfaces/msg/ParameterEvent"](
         stamp=T["builtin_interfaces/msg/Time"](sec=1, nanosec=0),
         node="/robot_state_publisher",
-        new_parameters=[parameter],
+        new_parameters=[T["rcl_interfaces/msg/Parameter"](name="robot_description", value=value)],
         changed_parameters=[],
         deleted_parameters=[],
     )
@@ -99,18 +99,16 @@ def test_a_log_that_describes_its_robot_needs_no_urdf(tmp_path: Path, kind: str)
         message = as_parameter(robot()) if kind == "parameter" else described(robot(), topic)
         path = log_with(tmp_path / "run.mcap", message)
     assert logged_urdf([path]).text == robot()
-    request = ReplayRequest(log=path, out=tmp_path / "out")
-    assert open_log(request)[0].joint_names == ("joint_a", "joint_b")
+    assert open_log(ReplayRequest(log=path, out=tmp_path / "out"))[0].joint_names == ("joint_a", "joint_b")
 
 
 def test_what_holds_states_and_is_no_log_is_replayed_with_the_urdf_that_is_given(tmp_path: Path) -> None:
     names = ("joint_a", "joint_b")
-    (tmp_path / "x.csv").write_text("t,a,b\n0,0.1,0.2\n0.01,0.1,0.2\n")
     columns = 'joints = ["joint_a", "joint_b"]\nposition = ["a", "b"]\ntime = "t"\n'
-    (tmp_path / "x.toml").write_text(f'[states]\nfile = "x.csv"\n{columns}')
-    folders = (tmp_path / "x.toml", lerobot(tmp_path / "set", 3, num_episodes=1, names={"motors": list(names)}))
-    for path in folders:
-        request = ReplayRequest(log=path, out=tmp_path / "out", urdf=written(tmp_path, robot()))
+    written(tmp_path, "t,a,b\n0,0.1,0.2\n0.01,0.1,0.2\n", "x.csv")
+    table, urdf = written(tmp_path, f'[states]\nfile = "x.csv"\n{columns}', "x.toml"), written(tmp_path, robot())
+    for path in (table, lerobot(tmp_path / "set", 3, num_episodes=1, names={"motors": list(names)})):
+        request = ReplayRequest(log=path, out=tmp_path / "out", urdf=urdf)
         assert open_log(request)[0].joint_names == names
 
 
@@ -161,8 +159,9 @@ def test_a_log_without_one_readable_robot_is_refused(
     tmp_path: Path, messages: tuple[RawMessage, ...], words: str
 ) -> None:
     path = log_with(tmp_path / "run.mcap", *messages)
-    with pytest.raises((InputError, UsageError), match=f"run.mcap.*{words}"):
-        open_log(ReplayRequest(log=path, out=tmp_path / "out"))
+    expect_refusal(
+        f"run.mcap.*{words}", open_log, ReplayRequest(log=path, out=tmp_path / "out"), error=(InputError, UsageError)
+    )
     if "broken" in words:
         assert "its robot_description cannot be read" in differs(read_urdf(written(tmp_path, robot())), [path])
 
@@ -188,9 +187,8 @@ def test_a_model_of_the_command_line_that_differs_as_a_mechanism_is_said(
     if not words:
         assert said.lines == []
         return
-    assert words in said.lines[0]
-    assert said.lines[0].startswith("warning: ")
-    assert said.lines[0].endswith("leave --urdf out to take the log's own, or correct the file")
+    remedy = "leave --urdf out to take the log's own, or correct the file"
+    assert re.fullmatch(f"warning: .*{re.escape(words)}.*{remedy}", said.lines[0])
     findings = check(CheckRequest(paths=(path,), urdf=file))[0].findings
     assert [finding.what for finding in findings if finding.code == "robot-model"] == [differs(found, [path])]
 
@@ -224,8 +222,12 @@ def test_a_robot_of_the_log_that_is_asked_for_is_used_or_refused(tmp_path: Path)
     request = ReconstructRequest(source=open_source(path), out=tmp_path / "out", recording=path, spheres=spheres)
     assert _robot(request, Said()).sphere_set.links == ("tip",)
     other = log_with(tmp_path / "other.mcap", described(robot(root="base")))
-    with pytest.raises(InputError, match=r"give --world-frame base, or --base with its pose"):
-        _robot(replace(request, source=open_source(other), recording=other), Said())
+    expect_refusal(
+        r"give --world-frame base, or --base with its pose",
+        _robot,
+        replace(request, source=open_source(other), recording=other),
+        Said(),
+    )
 
 
 def test_a_replay_says_where_it_places_the_robot_of_the_log(tmp_path: Path) -> None:
@@ -259,7 +261,6 @@ def test_a_capture_keeps_the_description(tmp_path: Path) -> None:
     assert describe(path).facts["robot_description"] == ["/robot_description"]
     capture = ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture")).out
     assert is_capture(capture)
-    assert (capture / "robot_description.urdf").read_text() == robot()
-    assert logged_urdf([capture]).text == robot()
+    assert (capture / "robot_description.urdf").read_text() == logged_urdf([capture]).text == robot()
     (capture / "robot_description.urdf").write_text(robot(shift=0.3))
     expect_refusal("its checksum differs from SHA256SUMS", logged_urdf, [capture])

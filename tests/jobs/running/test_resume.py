@@ -23,6 +23,7 @@ from splatctrl_cli.jobs.running.progress import Wait, duration
 from splatctrl_cli.scene.fitter import SceneFitter
 from tests.jobs.bake.baked import Said
 from tests.jobs.stage import contents, failing
+from tests.robot.shapes import written
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
@@ -75,9 +76,8 @@ def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_writer, name, failing(getattr(scene_writer, name), when, KeyboardInterrupt()))
         assert main(given) == 130
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert ("scene.partial is kept" in err) == has_checkpoint
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("scene.partial is kept" in line) == has_checkpoint
     assert not (tmp_path / "scene").exists()
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole[kind]
@@ -95,8 +95,7 @@ def test_a_budget_left_at_its_default_grows_to_what_the_first_frames_show(
         patch.setattr(scene_writer, "savez", failing(scene_writer.savez, 2, KeyboardInterrupt()))
         assert main(given) == 130
     assert main([*given, "--resume"]) == 0
-    document = json.loads((tmp_path / "scene" / "run.json").read_text())
-    assert document["config"]["scene"]["max_splats"] == 800
+    assert json.loads((tmp_path / "scene" / "run.json").read_text())["config"]["scene"]["max_splats"] == 800
     assert main([*command(recording, "log", tmp_path / "whole"), "--max-splats", "200"]) == 0
     assert contents(tmp_path / "scene") == contents(tmp_path / "whole")
 
@@ -109,10 +108,8 @@ def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_writer, "write_ply", failing(scene_writer.write_ply, 4, full))
         assert main(given) == 6
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "000003.ply: writing failed: No space left" in err
-    assert "--resume" in err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "000003.ply: writing failed: No space left" in line and "--resume" in line
     assert main([*given, "--resume"]) == 0
     assert contents(tmp_path / "scene") == whole["log"]
 
@@ -123,8 +120,7 @@ def test_a_file_size_limit_is_a_full_disk_too(recording: Path, tmp_path: Path) -
     limited += "from splatctrl_cli.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = [sys.executable, "-B", "-c", limited, *command(recording, "log", tmp_path / "scene")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 6
-    assert done.stderr.count("\n") == 1
+    assert (done.returncode, done.stderr.count("\n")) == (6, 1)
     assert "writing failed: File too large" in done.stderr
     assert not list(tmp_path.iterdir())  # no checkpoint was whole
 
@@ -202,27 +198,22 @@ def test_a_run_goes_on_only_as_what_it_was(
     changed: list[str],
     said: str,
 ) -> None:
-    capsys.readouterr()
-    partial = tmp_path / "scene.partial"
+    partial, given = tmp_path / "scene.partial", list(interrupted)
     before = {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
-    given = list(interrupted)
     if changed == ["VERSION"]:
         monkeypatch.setattr("splatctrl_cli.jobs.running.device.__version__", "99")
-        changed = []
     elif changed == ["URDF"]:
-        other = tmp_path / "robot.urdf"
-        other.write_text((recording / "robot.urdf").read_text() + "\n")
-        given[given.index("--urdf") + 1] = str(other)
-        changed = []
+        given[given.index("--urdf") + 1] = str(written(tmp_path, (recording / "robot.urdf").read_text() + "\n"))
     elif changed == ["LOG"]:
         few = ["--duration", "0.6", "--width", "32", "--height", "24"]
         assert main(["simulate", "-o", str(tmp_path / "b"), *few]) == 0
-        given[1], changed = str(tmp_path / "b" / "log.mcap"), []
-        capsys.readouterr()
-    assert main([*given, *changed, "--resume"]) == 2
-    err = capsys.readouterr().err
-    assert said in err
-    assert err.count("\n") == 1
+        given[1] = str(tmp_path / "b" / "log.mcap")
+    else:
+        given += changed
+    capsys.readouterr()
+    assert main([*given, "--resume"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
     assert before == {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
 
 
@@ -266,9 +257,8 @@ def test_snapshots_are_taken_by_count_by_time_and_of_new_obstacles(
     given = [word for setting in settings for word in ("--set", setting)]
     assert main([*command(recording, "log", tmp_path / "scene"), "--cameras", "cam0", *given]) == 0
     scene = open_scene(tmp_path / "scene")
-    rows = [json.loads(line) for line in (tmp_path / "scene" / "audit.jsonl").read_text().splitlines()]
-    assert len(rows) == 6
-    assert [s.stamp_ns for s in scene.snapshots] == [rows[k]["stamp_ns"] for k in taken]
+    stamps = [json.loads(line)["stamp_ns"] for line in (scene.path / "audit.jsonl").read_text().splitlines()]
+    assert (len(stamps), [s.stamp_ns for s in scene.snapshots]) == (6, [stamps[k] for k in taken])
 
 
 @pytest.mark.parametrize(
@@ -289,8 +279,7 @@ def test_a_wait_is_announced_and_says_how_long_it_still_is(
     for seconds in steps:
         now[0] += seconds
         wait.step()
-    assert len(said.lines) == num_lines
-    assert said.lines[0] == f"fits views: {num} iterations"
+    assert (len(said.lines), said.lines[0]) == (num_lines, f"fits views: {num} iterations")
     assert said.lines[1:2] + said.lines[-1:] == [f"fits views: {words}" for words in (first, last)] or not first
 
 
@@ -322,7 +311,6 @@ def warnings_in(path: Path) -> list[tuple[str, str]]:
 
 
 def test_every_warning_has_a_remedy() -> None:
-    rooms = Path(splatctrl_cli.__file__).parent
-    found = [text for path in sorted(rooms.rglob("*.py")) for text in warnings_in(path)]
+    found = [text for path in sorted(Path(splatctrl_cli.__file__).parent.rglob("*.py")) for text in warnings_in(path)]
     assert len(found) > 6
     assert [text for text in found if ";" not in text[1] and not text[1].endswith("{}")] == []

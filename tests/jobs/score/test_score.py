@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.verdict import JudgedResult
 from splatctrl_cli.evaluate.views import psnr
 from splatctrl_cli.formats.splat.gaussian_ply import write_gaussian_ply
@@ -28,7 +28,7 @@ from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.folder.dtu import DtuView, write_dtu
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import GaussianSet, Label, RgbdFrame
+from splatctrl_cli.records import GaussianSet, Label, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render_gaussians
 from tests.jobs.score.wall import (
     AWAY,
@@ -48,6 +48,8 @@ from tests.jobs.score.wall import (
 from tests.recording.log.make_log import FRAME_NS, START_NS, LogRecipe, make_log, messages_of, write_raw
 from tests.refused import expect_refusal
 
+ROBOTS = np.full(len(wall()), Label.ROBOT, np.uint8)
+
 
 @pytest.fixture
 def scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -62,19 +64,16 @@ def run(folder: Path, cameras: tuple[str, ...] | None = None, **changes: Any) ->
 
 def test_views_are_rendered_from_the_newest_snapshot_early_ones_counted_and_seen_pixels_told(scored: Path) -> None:
     result = run(scored)
-    assert result.document["cameras"] == ["cam3"]
-    assert result.document["skipped_views"] == ["cam3-0000"]
+    assert (result.document["cameras"], result.document["skipped_views"]) == (["cam3"], ["cam3-0000"])
     dark, right, away = result.document["views"]
     assert (dark["view"], right["view"], away["view"]) == ("cam3-0001", "cam3-0002", "cam3-0003")
     assert dark["psnr_all"] == pytest.approx(20.0, abs=0.6), "0.4 instead of 0.5"
     assert right["psnr_all"] == pytest.approx(40.0, abs=2.5), "off by 0.01, and rounded to 8 bits"
-    assert right["depth_median_all"] < 1e-6
-    assert (result.metrics["num_views"], result.metrics["num_skipped"]) == (3, 1)
-    assert (result.verdict.counts["psnr_all"], result.verdict.counts["psnr_seen"], result.notes) == (2, 2, ())
     assert right["seen_share"] == pytest.approx(58 / 64, abs=0.03), "the view is moved by 0.1 m, 6 pixels"
-    assert away["seen_share"] == 0.0
-    assert away["psnr_seen"] is None
-    assert away["depth_median_all"] is None
+    assert right["depth_median_all"] < 1e-6
+    assert [away[name] for name in ("seen_share", "psnr_seen", "depth_median_all")] == [0.0, None, None]
+    assert (result.metrics["num_views"], result.metrics["num_skipped"], result.notes) == (3, 1, ())
+    assert (result.verdict.counts["psnr_all"], result.verdict.counts["psnr_seen"]) == (2, 2)
 
 
 def test_final_splats_serve_all_views_when_asked(scored: Path) -> None:
@@ -87,48 +86,36 @@ def test_without_a_clock_every_view_is_scored_from_the_final_splats(
 ) -> None:
     set_up(monkeypatch, FakeScene(has_clock=False, snapshots=()), FakeSource(frames=FRAMES, has_clock=False))
     report = run(scored).document
-    assert report["snapshots"] == "final"
-    assert report["metrics"]["num_skipped"] == 0
-    assert len(report["views"]) == 4
+    assert (report["snapshots"], report["metrics"]["num_skipped"], len(report["views"])) == ("final", 0, 4)
 
 
-@pytest.mark.parametrize("label", [None, Label.ROBOT])
+@pytest.mark.parametrize("splats", [wall().select(np.zeros(len(wall()), bool)), replace(wall(), labels=ROBOTS)])
 def test_a_scene_without_a_splat_that_counts_is_not_evaluable_and_leaves_nothing(
-    scored: Path, monkeypatch: pytest.MonkeyPatch, label: Label | None
+    scored: Path, monkeypatch: pytest.MonkeyPatch, splats: SplatSet
 ) -> None:
-    splats = wall()
-    if label is None:
-        splats = splats.select(np.zeros(len(splats), bool))
-    else:
-        splats.labels[:] = label
     monkeypatch.setattr(FakeScene, "splats", lambda scene: splats)
-    with pytest.raises(NotEvaluableError, match=f"none of {len(splats)} is labelled object, human; give a scene"):
-        run(scored, out=scored / "out")
+    words = f"none of {len(splats)} is labelled object, human; give a scene"
+    expect_refusal(words, run, scored, out=scored / "out", error=NotEvaluableError)
     assert [path.name for path in scored.iterdir()] == ["scene"]
 
 
 def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) -> None:
-    result = run(scored, out=scored / "score")
-    assert result.out == scored / "score"
+    result, out = run(scored, out=scored / "score"), scored / "score"
     names = sorted(path.name for path in result.out.iterdir())
-    assert names == ["cam3_best_worst.png", "run.json", "score.json", "views.csv"]
-    rows = list(csv.DictReader((result.out / "views.csv").read_text().splitlines()))
-    report = json.loads((result.out / "score.json").read_text())
-    assert report == result.document
+    assert (result.out, names) == (out, ["cam3_best_worst.png", "run.json", "score.json", "views.csv"])
+    rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
+    report, run_json = (json.loads((out / name).read_text()) for name in ("score.json", "run.json"))
+    assert (report, run_json["metrics"]) == (result.document, report["metrics"])
     assert [row["view"] for row in rows] == [view["view"] for view in report["views"]]
-    assert float(rows[0]["psnr_all"]) == report["views"][0]["psnr_all"]
-    assert rows[2]["psnr_seen"] == ""
-    run_json = json.loads((result.out / "run.json").read_text())
-    assert run_json["metrics"] == report["metrics"]
-    assert compare(CompareRequest(runs=(result.out, result.out))).metrics["num_figures"] > 5
+    assert (float(rows[0]["psnr_all"]), rows[2]["psnr_seen"]) == (report["views"][0]["psnr_all"], "")
+    assert compare(CompareRequest(runs=(out, out))).metrics["num_figures"] > 5
     assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
 
 
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path) -> None:
     result = run(scored, require=("psnr_all>=1",))
     assert result.document["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"
-    assert result.verdict.exit_code == 5
-    assert "psnr_all is unknown" in result.verdict.sentence
+    assert result.verdict.exit_code == 5 and "psnr_all is unknown" in result.verdict.sentence
 
 
 def test_a_training_camera_is_scored_only_when_allowed(scored: Path) -> None:
@@ -169,13 +156,10 @@ def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: p
     (view,) = report["views"]
     assert (view["view"], view["camera"], report["training_cameras"]) == ("holdout-0001", "holdout", ["camera"])
     assert view["psnr_seen"] == pytest.approx(20.0, abs=0.6)
-    assert view["depth_median_seen"] < 1e-5
-    assert view["seen_share"] > 0.8
-    whole = RecordingRequest(path=scored / "dtu", is_dtu=True)
-    with pytest.raises(
-        UsageError, match=r"each camera has the name of one that trained the scene \(camera\); give the"
-    ):
-        score(ScoreRequest(scene=scored / "scene", recording=whole))
+    assert view["depth_median_seen"] < 1e-5 and view["seen_share"] > 0.8
+    whole = ScoreRequest(scene=scored / "scene", recording=RecordingRequest(path=scored / "dtu", is_dtu=True))
+    words = r"each camera has the name of one that trained the scene \(camera\); give the"
+    expect_refusal(words, score, whole, error=UsageError)
 
 
 def test_what_lies_in_free_space_is_scored(scored: Path) -> None:
@@ -189,8 +173,8 @@ def test_what_lies_in_free_space_is_scored(scored: Path) -> None:
 def test_a_render_before_the_recorded_surface_is_in_front(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     late = frame(3 * SECOND, "cam3", SIDE)
     late.depth[late.depth > 0] += 0.05
-    seen = frame(3 * SECOND, "cam0", FRONT)
-    set_up(monkeypatch, FakeScene(), FakeSource(frames=[seen, frame(2 * SECOND, "cam3", SIDE), late]))
+    frames = [frame(3 * SECOND, "cam0", FRONT), frame(2 * SECOND, "cam3", SIDE), late]
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=frames))
     assert [view["in_front_all"] for view in run(scored).document["views"]] == [0.0, 1.0]
 
 
@@ -233,9 +217,9 @@ def run_session(folder: Path, *names: str) -> JudgedResult:
 
 def test_a_camera_of_another_log_is_scored_beside_the_log_that_trained(session: Path) -> None:
     report = run_session(session, "a.mcap", "b.mcap").document
-    assert (report["cameras"], report["metrics"]["num_views"]) == (["cam1"], 5)
+    told = report["cameras"], report["metrics"]["num_views"], report["reference"]
+    assert told == (["cam1"], 5, f"{session / 'a.mcap'} + {session / 'b.mcap'}")
     assert report["metrics"]["seen_share"] > 0.99, "both cameras stand at one place"
-    assert report["reference"] == f"{session / 'a.mcap'} + {session / 'b.mcap'}"
 
 
 def test_several_references_are_one_session(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -247,10 +231,12 @@ def test_several_references_are_one_session(session: Path, capsys: pytest.Captur
 def test_the_other_log_alone_asks_for_the_one_that_trained(session: Path) -> None:
     whole = make_log(session / "whole.mcap", LogRecipe(cameras=("cam0", "cam1")))
     write_raw(session / "alone.mcap", filter(of("cam1", "tf"), messages_of(whole)))
-    with pytest.raises(
-        InputError, match=r"has no camera cam0; give that recording, .* give both, each as --reference"
-    ):
-        run_session(session, "alone.mcap")
+    expect_refusal(
+        r"has no camera cam0; give that recording, .* give both, each as --reference",
+        run_session,
+        session,
+        "alone.mcap",
+    )
 
 
 def test_a_camera_that_no_transform_joins_to_the_world_is_refused_by_name(session: Path) -> None:
@@ -270,8 +256,13 @@ def test_a_camera_of_another_time_is_refused_by_name(session: Path) -> None:
 
 
 def test_a_log_beside_an_image_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"views.toml: expected a log, as the others are, got a folder of images"):
-        RecordingRequest(path=tmp_path / "views.toml", others=(tmp_path / "b.mcap",))
+    expect_refusal(
+        r"views.toml: expected a log, as the others are, got a folder of images",
+        RecordingRequest,
+        path=tmp_path / "views.toml",
+        others=(tmp_path / "b.mcap",),
+        error=UsageError,
+    )
 
 
 STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)
@@ -288,14 +279,9 @@ def one_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def wall_with_harmonics() -> GaussianSet:
     """The wall, its Gaussians stretched and of another colour from each side."""
     round_ones = as_gaussians(wall())
-    rng = np.random.default_rng(0)
-    shape = (len(round_ones), 3, 3)
-    more = rng.uniform(-0.3, 0.3, shape).astype(np.float32)
-    return replace(
-        round_ones,
-        scales=round_ones.scales * STRETCHED,
-        harmonics=np.concatenate([round_ones.harmonics, more], axis=1),
-    )
+    more = np.random.default_rng(0).uniform(-0.3, 0.3, (len(round_ones), 3, 3)).astype(np.float32)
+    harmonics = np.concatenate([round_ones.harmonics, more], axis=1)
+    return replace(round_ones, scales=round_ones.scales * STRETCHED, harmonics=harmonics)
 
 
 def run_file(file: Path, **changes: object) -> JudgedResult:
@@ -311,8 +297,7 @@ def test_stretched_gaussians_with_harmonics_are_scored_as_they_are(one_view: Pat
     render = render_gaussians(gaussians, INTRINSICS, SIDE, threads=1).color
     assert result.metrics["psnr_all"] == pytest.approx(psnr(np.clip(render, 0, 1), frame.color / 255.0), abs=0.01)
     assert (one_view / "out" / "score.json").is_file()
-    assert "does not say which views trained it" in result.notes[0]
-    assert result.metrics["psnr_seen"] is None
+    assert "does not say which views trained it" in result.notes[0] and result.metrics["psnr_seen"] is None
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat", ".spz"])
@@ -345,5 +330,10 @@ def test_splats_in_another_unit_are_refused(one_view: Path) -> None:
 
 def test_a_surface_cannot_be_looked_at_without_training_views(one_view: Path) -> None:
     write_gaussian_ply(one_view / "other.ply", wall_with_harmonics(), {})
-    with pytest.raises(UsageError, match="--cloud: the surface is looked at from the views that trained, which"):
-        run_file(one_view / "other.ply", cloud=CloudSettings(path=one_view / "cloud.ply"))
+    expect_refusal(
+        "--cloud: the surface is looked at from the views that trained, which",
+        run_file,
+        one_view / "other.ply",
+        cloud=CloudSettings(path=one_view / "cloud.ply"),
+        error=UsageError,
+    )

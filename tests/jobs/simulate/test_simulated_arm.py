@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.simulate.simulate import SimulateRequest, simulate
@@ -61,10 +61,9 @@ def arm(tmp_path_factory: pytest.TempPathFactory, plain_arm: Path) -> Path:
     text = (plain_arm / "tabletop" / "robot.urdf").read_text().replace('name="joint', 'name="my_joint')
     text = re.sub(r'<cylinder radius="(\S+)" length="(\S+)"/>', r'<box size="\1 \1 \2"/>', text)
     text = re.sub(r'<sphere radius="(\S+)"/>', r'<box size="\1 \1 \1"/>', text)
-    start = text.index('<link name="link5">')
-    end = text.index("</link>", start)
+    before, link, after = text.partition('<link name="link5">')
     geometry = '<collision><geometry><mesh filename="package://my_arm/meshes/forearm.stl"/></geometry></collision>'
-    text = f'{text[:start]}<link name="link5">{geometry}{text[end:]}'
+    text = before + link + geometry + after[after.index("</link>") :]
     return written(folder, text.replace("</robot>", f"{FINGERS}</robot>"), "my_arm.urdf")
 
 
@@ -72,8 +71,11 @@ def arm(tmp_path_factory: pytest.TempPathFactory, plain_arm: Path) -> Path:
 def simulated(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("simulated") / "log"
     moved = shutil.copyfile(arm, tmp_path_factory.mktemp("elsewhere") / "arm.urdf")
-    with pytest.raises(InputError, match=r"package://my_arm/meshes/forearm\.stl was not found; .* --packages"):
-        simulate(SimulateRequest(out=out, urdf=moved, options=OPTIONS))
+    expect_refusal(
+        r"package://my_arm/meshes/forearm\.stl was not found; .* --packages",
+        simulate,
+        SimulateRequest(out=out, urdf=moved, options=OPTIONS),
+    )
     assert not out.exists()
     simulate(SimulateRequest(out=out, urdf=moved, packages=(arm.parents[1],), options=OPTIONS))
     return out
@@ -85,16 +87,15 @@ def test_the_folder_holds_the_arm_with_its_meshes_and_covering_spheres(simulated
     model = RobotModel.from_urdf(simulated / "robot.urdf", simulated / "robot_spheres.yaml")
     assert coverage_deficit(urdf, model.sphere_set).max_deficit == 0.0
     truth = load_truth(simulated / "truth.json")
-    assert truth.joint_names == tuple(f"my_joint{k}" for k in range(1, 8))
-    assert truth.clearance.min() > 0.02
+    assert truth.joint_names == tuple(f"my_joint{k}" for k in range(1, 8)) and truth.clearance.min() > 0.02
 
 
 def test_every_depth_of_the_log_lies_on_the_arm_or_in_the_scene(simulated: Path) -> None:
     truth = load_truth(simulated / "truth.json")
     source = open_source(simulated / "log.mcap", SourceOptions())
-    assert source.joint_names == truth.joint_names
     model = RobotModel.from_urdf(simulated / "robot.urdf", simulated / "robot_spheres.yaml")
     model = model.moved_by(source.joint_names)
+    assert source.joint_names == truth.joint_names
     surface, q, on_mesh = model.surface, np.zeros(7), 0
     forearm = MeshDistance(load_mesh(simulated / "meshes" / "forearm.stl"))
     for record in source.records():
@@ -102,8 +103,8 @@ def test_every_depth_of_the_log_lies_on_the_arm_or_in_the_scene(simulated: Path)
             q = record.position
             continue
         assert isinstance(record, RgbdFrame)
-        points = transform_points(record.T_world_camera, back_project(record.intrinsics, record.depth))
-        points = points[record.depth > 0]
+        points = back_project(record.intrinsics, record.depth)[record.depth > 0]
+        points = transform_points(record.T_world_camera, points)
         poses = {link: model.frame_pose(q, link) for link in surface.links}
         to_scene = np.abs(distance_to(truth.primitives, points, record.stamp_ns))
         to_solids = np.abs(surface.distance(surface.poses(poses), points))
@@ -124,8 +125,7 @@ def test_given_spheres_are_taken_and_the_same_kinematics_move_alike(
     arm: Path, simulated: Path, tmp_path: Path
 ) -> None:
     spheres = simulated / "robot_spheres.yaml"
-    urdf = written(arm.parent, arm.read_text().replace(FINGERS, ""), "my_bare_arm.urdf")
-    out = tmp_path / "out"
+    urdf, out = written(arm.parent, arm.read_text().replace(FINGERS, ""), "my_bare_arm.urdf"), tmp_path / "out"
     simulate(SimulateRequest(out=out, urdf=urdf, spheres=spheres, options=OPTIONS))
     assert (out / "robot_spheres.yaml").read_bytes() == spheres.read_bytes()
     source = open_source(out / "log.mcap", SourceOptions())
@@ -150,9 +150,10 @@ def test_a_link_is_seen_by_its_visual_mesh_where_that_can_be_read(
         (urdf.parent / "meshes" / "seen.dae").write_text(collada(rod))
     visual = f'<visual><geometry><mesh filename="package://my_arm/meshes/seen.{suffix}"/></geometry></visual>'
     urdf.write_text(urdf.read_text().replace('<link name="link5">', f'<link name="link5">{visual}'))
-    heard = Said()
-    spheres = simulated / "robot_spheres.yaml"
-    simulate(SimulateRequest(out=tmp_path / "out", urdf=urdf, spheres=spheres, options=OPTIONS), heard)
+    request = SimulateRequest(
+        out=tmp_path / "out", urdf=urdf, spheres=simulated / "robot_spheres.yaml", options=OPTIONS
+    )
+    simulate(request, heard := Said())
     copy = read_urdf(tmp_path / "out" / "robot.urdf")
     assert {mesh.filename for mesh in copy.meshes} == {"meshes/forearm.stl"}
     seen = visual_urdf(copy)

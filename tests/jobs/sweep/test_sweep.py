@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.jobs.compare.judged_runs import read_judged
 from splatctrl_cli.jobs.sweep.sweep import SweepRequest, SweepResult, sweep
@@ -23,11 +23,10 @@ def run_of(folder: Path, outcome: str = "passed", words: tuple[str, ...] = (), *
         (folder / name).mkdir(parents=True)
     (folder / "log").write_text(json.dumps(told))
     (folder / "arm.urdf").write_text("<robot/>")
-    arguments = ["replay", str(folder / "log"), "--scene", str(folder / "scene"), "--urdf", str(folder / "arm.urdf")]
     inputs = {name: sha256(folder / name) for name in ("log", "arm.urdf")}
-    arguments += [*words, "-o", str(folder / "audit")]
-    config = config_of(period=told.get("period", 0.01))
-    document = document_of(outcome, arguments=arguments, inputs=inputs, config=config)
+    options = ("--scene", folder / "scene", "--urdf", folder / "arm.urdf", *words, "-o", folder / "audit")
+    arguments, config = ["replay", folder / "log", *options], config_of(period=told.get("period", 0.01))
+    document = document_of(outcome, arguments=[*map(str, arguments)], inputs=inputs, config=config)
     write_json(folder / "audit" / "run.json", document)
     return folder / "audit"
 
@@ -56,8 +55,7 @@ def test_a_sweep_twice_runs_nothing_and_writes_the_same_bytes(tmp_path: Path) ->
     swept(run, "margin=0.02:0.1")
     file = tmp_path / "sweep" / "sweep.json"
     before, runs = file.read_bytes(), told(run)
-    again = swept(run, "margin=0.02:0.1")
-    assert (file.read_bytes(), told(run), again.num_new) == (before, runs, 0)
+    assert (file.read_bytes(), told(run), swept(run, "margin=0.02:0.1").num_new) == (before, runs, 0)
     swept(run, "margin=0.02:0.1", out="other", workers=2)
     assert (tmp_path / "other" / "sweep.json").read_bytes() == before
 
@@ -110,12 +108,9 @@ def test_a_latency_is_told_at_its_first_flip_with_what_comes_behind_it(
 
 
 def test_two_keys_together_flip_before_either_alone(tmp_path: Path) -> None:
-    run = run_of(tmp_path, slope={"latency": 1.25, "margin": 12.5})
-    result = swept(run, "latency=0:1", "margin=0:0.1")
-    alone = [flip.first.values for flip in result.flips if flip.first is not None]
-    assert alone[0]["latency"] == pytest.approx(0.8, abs=0.02) and alone[1]["margin"] == pytest.approx(
-        0.08, abs=0.002
-    )
+    result = swept(run_of(tmp_path, slope={"latency": 1.25, "margin": 12.5}), "latency=0:1", "margin=0:0.1")
+    alone = [flip.first.values[name] for flip, name in zip(result.flips, ("latency", "margin"), strict=True)]
+    assert alone == [pytest.approx(0.8, abs=0.02), pytest.approx(0.08, abs=0.002)]
     assert result.least.length == pytest.approx(0.8 / 2**0.5, abs=0.04)
     assert (result.least.last.outcome, result.least.first.outcome) == ("passed", "failed")
 
@@ -158,16 +153,19 @@ def test_a_recording_that_changed_or_moved_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_that_has_other_settings_when_it_is_made_again_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"made again it has other settings: control\.period; its --config"):
-        swept(run_of(tmp_path, period=0.02), "margin=0.03:0.1")
+    expect_refusal(
+        r"made again it has other settings: control\.period; its --config",
+        swept,
+        run_of(tmp_path, period=0.02),
+        "margin=0.03:0.1",
+    )
 
 
 def test_a_sweep_with_other_settings_does_not_go_on_in_the_folder(tmp_path: Path) -> None:
     run = run_of(tmp_path)
     swept(run, "latency=0:0.5")
-    expect_refusal(
-        "begun with other settings: over, tolerance", swept, run, "latency=0:1", tolerance=0.1, error=UsageError
-    )
+    words = "begun with other settings: over, tolerance"
+    expect_refusal(words, swept, run, "latency=0:1", tolerance=0.1, error=UsageError)
     expect_refusal("is no sweep", swept, run, "latency=0:1", out="audit", error=UsageError)
 
 
@@ -180,5 +178,9 @@ def test_a_value_that_a_command_refuses_is_a_flip_of_its_own(tmp_path: Path) -> 
 
 
 def test_a_run_that_ends_for_another_reason_ends_the_sweep_by_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"latency=1: replay came to no verdict: not so; see .*\.log"):
-        swept(run_of(tmp_path, refuses=0.6, code=70), "latency=0:1")
+    expect_refusal(
+        r"latency=1: replay came to no verdict: not so; see .*\.log",
+        swept,
+        run_of(tmp_path, refuses=0.6, code=70),
+        "latency=0:1",
+    )
