@@ -80,8 +80,7 @@ def test_every_file_is_described_and_refused_in_one_line_where_it_is_cut(tmp_pat
     name, facts = DESCRIBED[kind.name]
     for file in write_grid(tmp_path, grid, [kind.name]):
         summary = describe(file)
-        assert summary.kind == name
-        assert {key: summary.facts.get(key) for key in facts} == facts
+        assert (summary.kind, {key: summary.facts.get(key) for key in facts}) == (name, facts)
         assert summary.facts.get("first_cell", grid.origin.tolist()) == pytest.approx(grid.origin, abs=1e-6)
         if kind.read is not None:
             assert summary.grids[0].rows == [[channel, "f4", "m"] for channel in grid.channels]

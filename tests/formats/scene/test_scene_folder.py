@@ -146,8 +146,7 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     for thresholds in ((0.3, 0.7), (0.01, 0.99)):
         assert (again.states(*thresholds) == states).all()
     seen = read_seen(tmp_path / "a.npz")
-    assert seen.is_free is not None
-    assert (seen.is_free == (states == VoxelState.FREE)).all()
+    assert seen.is_free is not None and (seen.is_free == (states == VoxelState.FREE)).all()
 
 
 @pytest.mark.parametrize("num_steps", [2, 239, 240, 255, 300])
@@ -174,8 +173,7 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
     assert (again.edges.centers.tolist(), again.edges.radii.tolist()) == ([[0.0, 0.5, 1.0]], [0.25])
     for balls in (again.unrepresented, *(read_unrepresented(tmp_path / name) for name in ("a.npz", "b.npz"))):
         assert balls.centers.tolist() == want.unrepresented.centers.tolist()
-        assert balls.labels.tolist() == [Label.HUMAN]
-        assert balls.radius == pytest.approx(0.025 * 3**0.5)
+        assert (balls.labels.tolist(), balls.radius) == ([Label.HUMAN], pytest.approx(0.025 * 3**0.5))
         assert balls.volume == pytest.approx(0.05**3)
     for name in ("a.npz", "b.npz"):
         seen = read_seen(tmp_path / name)

@@ -91,8 +91,7 @@ def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -
         reduced, back = found.reduce(gaussians), found.read(tmp_path / f"a{suffix}")[0]
         assert not differences(reduced, back).beyond(found.bound(gaussians))
         assert differences(reduced, gaussians).color > 5
-    assert back.scales[0, 1] == pytest.approx(np.exp(-10), rel=1e-5)
-    assert back.harmonics[1, 5, 0] == -1.0
+    assert (back.scales[0, 1], back.harmonics[1, 5, 0]) == (pytest.approx(np.exp(-10), rel=1e-5), -1.0)
 
 
 def test_a_difference_beyond_the_bound_is_named() -> None:

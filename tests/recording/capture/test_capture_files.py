@@ -108,8 +108,7 @@ def test_a_damaged_image_is_left_out_and_counted(tmp_path: Path) -> None:
     image.write_bytes(image.read_bytes()[:-4])
     (folder / "color/cam0/000004.jpg").unlink()
     source = open_source(folder)
-    assert len(list(source.records())) == len(before) - 2
-    assert source.loss.damaged == 2
+    assert (len(list(source.records())), source.loss.damaged) == (len(before) - 2, 2)
     next(source.records())
     assert source.loss.damaged == 2, "a second pass that ends early forgets nothing"
     assert "depth/cam0/000002.png: its checksum differs" in source.loss.notes[0]
@@ -448,8 +447,7 @@ def replace_file(capture: Path, name: str, data: bytes) -> None:
 
 
 def read(capture: Path) -> int:
-    names = open_source(capture).joint_names
-    return sum(1 for _ in open_states(capture, SourceOptions(), names).records())
+    return sum(1 for _ in open_states(capture, SourceOptions(), open_source(capture).joint_names).records())
 
 
 @pytest.mark.parametrize(

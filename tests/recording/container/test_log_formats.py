@@ -58,15 +58,13 @@ def assert_same(before: list[Record], after: list[Record]) -> None:
     for a, b in zip(before, after, strict=True):
         assert a.stamp_ns == b.stamp_ns
         if isinstance(a, RgbdFrame):
-            assert isinstance(b, RgbdFrame)
-            assert np.array_equal(a.color, b.color)
+            assert isinstance(b, RgbdFrame) and np.array_equal(a.color, b.color)
             assert np.array_equal(a.depth, b.depth)
             assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
             assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
             assert np.array_equal(a.human, b.human) and np.array_equal(a.valid, b.valid)
         else:
-            assert isinstance(b, JointState)
-            assert np.array_equal(a.position, b.position)
+            assert isinstance(b, JointState) and np.array_equal(a.position, b.position)
             assert np.array_equal(a.velocity, b.velocity)
 
 

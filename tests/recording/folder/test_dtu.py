@@ -284,8 +284,7 @@ def test_without_depth_a_view_of_idr_stays_and_depth_maps_may_lie_elsewhere(tmp_
     shutil.rmtree(write_idr(tmp_path / "plain", "scan7", VIEWS) / "depth")
     source = DtuSource(tmp_path / "plain")
     assert not source.has_depth
-    assert len(frames_of(source)) == 4
-    assert source.loss.notes[0] == "000000.png: without depth"
+    assert (len(frames_of(source)), source.loss.notes[0]) == (4, "000000.png: without depth")
     assert DtuSource(tmp_path / "plain", depths=scan / DEPTHS).has_depth
     expect_refusal(
         r"nowhere: expected depth_map_0000.pfm", DtuSource, tmp_path / "plain", depths=tmp_path / "nowhere"
@@ -324,8 +323,7 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     full = replace(VIEWS[0], color=color, mask=color[:, :, 0] > 0)
     small = shrink_view(full, 4)
     assert small.color.shape == (12, 16, 3)
-    assert small.color[2, 5, 0] == 200
-    assert small.color.sum() == 3 * 200
+    assert (small.color[2, 5, 0], small.color.sum()) == (200, 3 * 200)
     assert np.argwhere(small.mask).tolist() == [[2, 5]]
     center_of_patch = np.array([[21.5, 9.5]])
     point = np.column_stack([(center_of_patch - [K.cx, K.cy]) / [K.fx, K.fy], [1.0]])

@@ -126,8 +126,7 @@ def test_float_depth_files_are_read_in_their_unit_and_rotated_counts_turned_back
     if suffix == "png":
         assert depth == pytest.approx(0.8)
         return
-    assert depth[0, :2].tolist() == [0, 0]
-    assert depth[1, 1] == np.float32(12345.6) * np.float32(1e-4)
+    assert (depth[0, :2].tolist(), depth[1, 1]) == ([0, 0], np.float32(12345.6) * np.float32(1e-4))
     assert source.loss.invalid_depth == 6
 
 
@@ -217,8 +216,7 @@ def test_real_folders_open_and_their_views_agree(
 ) -> None:
     source = open_source(EXAMPLES / f"{example}.toml", SourceOptions(root=real_data / folder))
     frames = frames_of(source)
-    assert len(frames) == num_frames
-    assert sum(frame.camera == "holdout" for frame in frames) == num_held
+    assert (len(frames), sum(frame.camera == "holdout" for frame in frames)) == (num_frames, num_held)
     assert vars(source.loss) == vars(type(source.loss)())
     views = sorted(frames, key=lambda frame: frame.stamp_ns)
     first, second = [view for view in views if view.camera == "camera"][:2]
@@ -228,8 +226,7 @@ def test_real_folders_open_and_their_views_agree(
     inside = (pixels >= 0).all(axis=1) & (pixels < [second.intrinsics.width, second.intrinsics.height]).all(axis=1)
     measured = second.depth[pixels[inside, 1], pixels[inside, 0]]
     difference = np.abs(measured - seen[inside, 2])[measured > 0]
-    assert len(difference) > 10_000
-    assert np.median(difference) < agreement
+    assert len(difference) > 10_000 and np.median(difference) < agreement
 
 
 def with_masks(tmp_path: Path, names: tuple[str, ...], mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Path:

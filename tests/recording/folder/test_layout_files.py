@@ -50,8 +50,7 @@ def test_a_sensor_file_is_read_by_itself_too_and_kept_as_it_is(tmp_path: Path) -
 
 def test_a_sensor_file_that_was_cut_gives_the_frames_before_and_counts_the_others(tmp_path: Path) -> None:
     source = open_source(make_sens(tmp_path, num_cut=40))
-    assert len(list(source.records())) == 2
-    assert source.loss.damaged == 1
+    assert (len(list(source.records())), source.loss.damaged) == (2, 1)
     assert source.loss.notes == [f"{SENS}: ends after 2 of 3 frames"]
 
 

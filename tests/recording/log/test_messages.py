@@ -43,8 +43,7 @@ def test_color_encodings_give_the_same_rgb(encoding: str, pixels: np.ndarray[Any
 @pytest.mark.parametrize("padding", [0, 4])
 def test_integer_depth_is_millimetres_in_either_byte_order(encoding: str, big: bool, padding: int) -> None:
     read = of_image(encoding, COUNTS, big=big, padding=padding)
-    assert read.kind == "depth"
-    assert depth_of(read, None) == pytest.approx(COUNTS * 1e-3, rel=1e-6)
+    assert (read.kind, depth_of(read, None)) == ("depth", pytest.approx(COUNTS * 1e-3, rel=1e-6))
     assert depth_of(read, 1e-4) == pytest.approx(COUNTS * 1e-4, rel=1e-6)
 
 
@@ -194,8 +193,7 @@ def test_every_form_of_a_compressed_image_is_told_apart(form: str, suffix: str, 
 def test_colour_png_of_sixteen_bits_or_with_alpha_keeps_bytes_that_decode_alike(lazily: bool) -> None:
     for pixels in (DEEP[..., ::-1], np.dstack([BGR, RGB[..., 0]])):
         read = of_file("png", packed(".png", pixels), lazily=lazily)
-        assert np.array_equal(color_of(read), RGB)
-        assert read.compressed is not None
+        assert np.array_equal(color_of(read), RGB) and read.compressed is not None
         assert np.array_equal(np.asarray(decode_file(read.compressed, color=True)), RGB)
     with pytest.raises(UndecodableMessageError, match="pixels of float64, neither colour nor depth"):
         of_file("64FC1; tiff compressed ", packed(".tiff", np.ones((4, 4), np.float64)), lazily=lazily)
@@ -225,8 +223,7 @@ def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_me
     bomb = png[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + png[33:]
     assert decode_file(png + b"behind the end", color=False) is not None
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
-    assert decode_file(bomb, color=False) is None
-    assert decode_file(png[:20] + png[-12:], color=False) is None
+    assert decode_file(bomb, color=False) is None and decode_file(png[:20] + png[-12:], color=False) is None
     assert decode_file(png[:33] + b"\x7f" + png[34:], color=False) is None  # a chunk of two gigabytes
 
 

@@ -32,8 +32,7 @@ def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
     position, truth = np.sin(2 * t)[:, None], 2 * np.cos(2 * t)[:, None]
     error = np.abs(differentiate(sent, position) - truth)
     raw = np.abs(np.gradient(position[:, 0], (sent - sent[0]) * 1e-9)[:, None] - truth)
-    assert error.max() < 0.04
-    assert np.median(error) < np.median(raw) / 10
+    assert error.max() < 0.04 and np.median(error) < np.median(raw) / 10
 
 
 def test_nothing_is_fitted_across_a_gap() -> None:

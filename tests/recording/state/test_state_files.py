@@ -118,8 +118,7 @@ def test_a_column_that_is_not_there_text_and_damage_are_named(tmp_path: Path, na
         inner = ""
     common: dict[str, Any] = {"file": name, "joints": list(AB), "time": f"{inner}t"}
     missing = refusal(described(tmp_path, **common, position=["angles"]))
-    assert "'angles': expected an array of numbers, got none" in missing
-    assert f"{inner}q" in missing
+    assert "'angles': expected an array of numbers, got none" in missing and f"{inner}q" in missing
     assert "got object of shape (20,)" in refusal(described(tmp_path, **common, position=[f"{inner}name"]))
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[: len(data) // 2])

@@ -127,8 +127,7 @@ def test_joints_that_nobody_asked_for_or_no_topic_has_do_no_harm(
     tmp_path: Path, messages: list[Message], joints: tuple[str, ...], noted: str
 ) -> None:
     source = opened(write_mcap(tmp_path / "x.mcap", messages), joints)
-    assert source.joint_names == AB
-    assert (len(states(source)), source.loss.damaged) == (20, 0)
+    assert (source.joint_names, len(states(source)), source.loss.damaged) == (AB, 20, 0)
     assert noted in "".join(source.loss.notes)
 
 
@@ -143,8 +142,7 @@ def test_controller_states_give_positions_velocities_and_commands(tmp_path: Path
         stamped = header(store, START_NS + i * STEP_NS)
         contents.append(built(kind, store, header=stamped, joint_names=AB, **said))
     found = states(opened(write_bag2(tmp_path / "bag", sent("/controller/state", kind, contents), store)))
-    assert len(found) == 20
-    assert found[3].position == pytest.approx(q[3])
+    assert (len(found), found[3].position) == (20, pytest.approx(q[3]))
     assert found[3].velocity == pytest.approx([1.0, 2.0])
     assert found[3].commanded_velocity == pytest.approx([1.5, 2.5])
 
@@ -182,8 +180,7 @@ def test_fingers_of_another_topic_join_a_franka_state_without_names(tmp_path: Pa
     store, q = store_with(franka_msgs__FrankaState=FRANKA_STATE), ramp(20, 7)
     fingers = ("fr3_finger_joint1", "fr3_finger_joint2")
     gripper = states_of(np.full((20, 2), 0.04), fingers, topic="/gripper")
-    log = write_mcap(tmp_path / "x.mcap", franka_1(store, q) + gripper, store)
-    source = opened(log, (*ARM, *fingers))
+    source = opened(write_mcap(tmp_path / "x.mcap", franka_1(store, q) + gripper, store), (*ARM, *fingers))
     assert source.joint_names == (*ARM, *fingers)
     assert states(source)[5].position == pytest.approx([*q[5], 0.04, 0.04])
 
@@ -286,7 +283,6 @@ def test_stamps_that_go_back_or_repeat_or_pause_are_sorted_and_counted(tmp_path:
 
 def test_a_real_log_gives_its_states_and_tells_a_velocity_that_nobody_filled(real_data: Path) -> None:
     joints = ("wrist_joint", "gripper_joint")
-    log = real_data / "rosbag2_mcap_sensor_msgs" / "rosbag2_2025_09_10-13_03_56_0.mcap"
-    source = opened(log, joints)
+    source = opened(real_data / "rosbag2_mcap_sensor_msgs" / "rosbag2_2025_09_10-13_03_56_0.mcap", joints)
     assert (source.joint_names, len(states(source)), source.loss.damaged) == (joints, 15, 0)
     assert any("velocities of gripper_joint are zero throughout" in note for note in source.loss.notes)
