@@ -15,8 +15,7 @@ from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, I
 from splatctrl_cli.recording.log.messages import DEPTH, ImageMessage, word_of
 from splatctrl_cli.recording.log.messages import OTHERS as OTHER_WORDS
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.recording.source import CameraTopics, SourceOptions, open_source
 from tests.recording.log.make_log import LogRecipe, Message, broken_log, built, make_log, messages_of, write_raw
 from tests.refused import expect_refusal
 

@@ -17,8 +17,7 @@ from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.log.registration import warp_depth
 from splatctrl_cli.recording.log.survey import survey
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, open_source
 from splatctrl_cli.records import RgbdFrame
 from tests.recording.log.make_log import built, by_axis, camera_info, encoded, frames_of, image, write_bag
 from tests.refused import expect_refusal
