@@ -7,8 +7,7 @@ import pytest
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.recording.calibrated import ChangedSource, Perturbation
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, open_source
 from splatctrl_cli.records import RgbdFrame
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.refused import expect_refusal

@@ -10,8 +10,7 @@ from splatctrl_cli.config.fixed import IMAGES_FEWEST_BACK
 from splatctrl_cli.recording.container.log_formats import SessionLog, open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage
 from splatctrl_cli.recording.log.survey import StampClock, dropped, first_of_each
-from splatctrl_cli.recording.source import describe, open_session, open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, describe, open_session, open_source
 from tests.recording.container.test_log_formats import assert_same
 from tests.recording.log.make_log import (
     FRAME_NS,

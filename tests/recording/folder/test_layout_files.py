@@ -11,8 +11,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.image_file import write_pfm
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.recording.capture.capture_writer import write_capture
-from splatctrl_cli.recording.source import describe, open_logs, open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, describe, open_logs, open_source
 from splatctrl_cli.records import Float64, RgbdFrame
 from tests.recording.folder.make_layout import (
     GIVEN,

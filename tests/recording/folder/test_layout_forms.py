@@ -16,8 +16,7 @@ from splatctrl_cli.recording.folder import layout_nerfstudio
 from splatctrl_cli.recording.folder.layout_scenes import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
 from splatctrl_cli.recording.folder.layout_tum import marker_to_camera
 from splatctrl_cli.recording.folder.poses import stamp_of_text
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, open_source
 from splatctrl_cli.records import Intrinsics
 from tests.recording.folder.make_layout import (
     GIVEN,

@@ -13,8 +13,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.recording.capture.capture_writer import write_capture
 from splatctrl_cli.recording.folder.image_folder import LAYOUTS, layout_of
 from splatctrl_cli.recording.folder.layout import Layout
-from splatctrl_cli.recording.source import describe, open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, describe, open_source
 from tests.recording.folder.make_layout import (
     EXAMPLES,
     GIVEN,
