@@ -118,8 +118,7 @@ def at(left: float, right: float, near: float, within: float) -> Callable[[Path,
     """The box's borders [m] are where they should be: a pixel's width may be missing."""
 
     def examine(folder: Path, out: Path, run: Run) -> None:
-        low, high = box_x(ingested(folder, out, run), near)
-        assert abs(low - left) < within and abs(high - right) < within, (low, high)
+        np.testing.assert_allclose(box_x(ingested(folder, out, run), near), (left, right), rtol=0, atol=within)
 
     return examine
 
@@ -179,8 +178,7 @@ def write_transforms(**lens: Any) -> Callable[[Path], None]:
 def folder_at_edge(folder: Path, out: Path, run: Run) -> None:
     """The box of a folder is where it stands."""
     expect_result(run, ["ingest", folder, "-o", out / "capture"])
-    low, high = box_x(frames_of(out / "capture")[0], 0.45)
-    assert abs(low - 0.5) < 0.03 and abs(high - 0.65) < 0.03
+    np.testing.assert_allclose(box_x(frames_of(out / "capture")[0], 0.45), (0.5, 0.65), rtol=0, atol=0.03)
 
 
 def folder_refused(*words: str) -> Callable[[Path, Path, Run], None]:

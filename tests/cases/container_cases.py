@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.recording.capture.capture import read_capture_header
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import RawMessage
@@ -162,10 +163,9 @@ def _examine_sdk(folder: Path, out: Path, run: Run) -> None:
         expect_result(run, ["ingest", path, "-o", capture, "--camera-pose", "device_0=identity"], "device_0 6")
         camera = read_capture_header(capture)["cameras"]["device_0"]
         assert [camera[name] for name in ("fx", "fy", "cx", "cy")] == [60.0, 60.0, 31.5, 23.5]
-        found, is_turned, expected = survey(open_raw_log(path)).realsense, path.stem == "turned", np.eye(4)
-        expected[:3, :3], expected[0, 3] = TURN if is_turned else np.eye(3), 0.015
+        found, is_turned = survey(open_raw_log(path)).realsense, path.stem == "turned"
         T_color_depth = found.T_between(f"{SDK_COLOR}/image/data", f"{SDK_DEPTH}/image/data")
-        np.testing.assert_allclose(T_color_depth, expected, atol=1e-6)
+        np.testing.assert_allclose(T_color_depth, pose_at([0.015, 0, 0], TURN if is_turned else np.eye(3)), atol=1e-6)
         assert found.depth_unit(f"{SDK_DEPTH}/image/data") == (0.00025 if is_turned else 0.001)
         depth = first_depth(capture)
         assert is_turned or abs(np.median(depth[depth > 0]) - 1.2) < 0.002
@@ -224,9 +224,13 @@ def _examine_codes(folder: Path, out: Path, run: Run) -> None:
             expect_result(run, ["reconstruct", path, "-o", out / f"{path.stem}.scene", "--set", *few])
 
 
+def counts_of(message: Any) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    """The pixels of a message of sixteen bits."""
+    return np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
+
+
 def _png(message: Any) -> bytes:
-    counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
-    return bytes(cv2.imencode(".png", counts)[1])
+    return bytes(cv2.imencode(".png", counts_of(message))[1])
 
 
 def _packed(form: str, head: bytes, pack: Callable[[Any], bytes] = _png) -> Callable[[Any], Any]:
@@ -236,14 +240,13 @@ def _packed(form: str, head: bytes, pack: Callable[[Any], bytes] = _png) -> Call
     return change
 
 
-def _jpeg(message: Any) -> bytes:
-    counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
-    return bytes(cv2.imencode(".jpg", (counts >> 4).astype(np.uint8))[1])
+def jpeg_of(message: Any) -> bytes:
+    """Sixteen bits of depth as a careless driver packs them."""
+    return bytes(cv2.imencode(".jpg", (counts_of(message) >> 4).astype(np.uint8))[1])
 
 
 def _rvl(message: Any) -> bytes:
-    counts = np.frombuffer(message.data.tobytes(), "<u2")
-    return struct.pack("<ii", message.width, message.height) + encoded_rvl(counts)
+    return struct.pack("<ii", message.width, message.height) + encoded_rvl(counts_of(message))
 
 
 HEAD = struct.pack("<iff", 0, 0.0, 0.0)
@@ -258,9 +261,9 @@ READ = {
 REFUSED = {
     "rvl-unsaid": (_packed("16UC1; compressedDepth", HEAD, _rvl), "RVL under the format '16UC1; compressedDepth'"),
     "rvl-other": (_packed("16UC1; rvl", HEAD, _rvl), "RVL under the format '16UC1; rvl'"),
-    "jpeg-inside": (_packed("16UC1; compressedDepth", HEAD, _jpeg), "JPEG loses depth: record PNG"),
-    "jpeg-said": (_packed("16UC1; jpeg compressed ", b"", _jpeg), "JPEG loses depth: record PNG"),
-    "jpeg": (_packed("jpeg", b"", _jpeg), "JPEG loses depth: record PNG"),
+    "jpeg-inside": (_packed("16UC1; compressedDepth", HEAD, jpeg_of), "JPEG loses depth: record PNG"),
+    "jpeg-said": (_packed("16UC1; jpeg compressed ", b"", jpeg_of), "JPEG loses depth: record PNG"),
+    "jpeg": (_packed("jpeg", b"", jpeg_of), "JPEG loses depth: record PNG"),
     "float-nohead": (_packed("32FC1; compressedDepth", b""), "32FC1 without the 12 bytes"),
 }
 

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.geometry import quat_from_rotation, strided_lens
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, open_source
 from tests.calibration.scan import views_of
 from tests.cases.case import Case, Run, expect_result
 from tests.conftest import ROOT

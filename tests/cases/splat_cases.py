@@ -33,8 +33,12 @@ TRIANGLES = (
 UTM = (500000.0, 5400000.0, 312.0)
 
 
-def plane_rows(origin: Sequence[float] = (0, 0, 0), place: str = "f8", **others: float) -> NDArray[Any]:
-    """A plane of round splats of 20 mm, 50 mm apart; `others` are columns beside, None for no such column."""
+def plane_rows(
+    origin: Sequence[float] = (0, 0, 0), place: str = "f8", unit: float = 1.0, **others: float
+) -> NDArray[Any]:
+    """A plane of round splats of 20 mm, 50 mm apart, its metres in `unit`; `others` are columns beside, None for no
+    such column.
+    """
     x, y = np.meshgrid(SPACING * np.arange(SIDE) - 0.475, SPACING * np.arange(SIDE) - 0.475)
     scales = dict.fromkeys(("scale_0", "scale_1", "scale_2"), float(np.log(0.02)))
     colour = {**dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"), 0.3), "opacity": 4.0, **scales}
@@ -42,7 +46,7 @@ def plane_rows(origin: Sequence[float] = (0, 0, 0), place: str = "f8", **others:
     columns = {name: value for name, value in given.items() if value is not None}
     rows = np.zeros(SIDE * SIDE, [*((axis, place) for axis in "xyz"), *((name, "f4") for name in columns)])
     for axis, values, offset in zip("xyz", (x, y, 0.01 * np.sin(7 * x)), origin, strict=True):
-        rows[axis] = values.ravel() + offset
+        rows[axis] = unit * (values.ravel() + offset)
     for name, value in columns.items():
         rows[name] = value
     return rows
@@ -89,7 +93,7 @@ def _examine_double(folder: Path, out: Path, run: Run) -> None:
         baked(run, file, out / f"field{suffix}")
     assert "origin" in run(["info", out / "moved.ply"]).text
     moved = read_positions(out / "moved.ply") + np.array([500000, 5400000, 300])
-    assert np.abs(moved - read_positions(source)).max() < 1e-6
+    np.testing.assert_allclose(moved, read_positions(source), rtol=0, atol=1e-6)
 
 
 def _siblings_of_double(folder: Path) -> None:
@@ -103,8 +107,7 @@ def _siblings_of_double(folder: Path) -> None:
 
 def _examine_siblings_of_double(folder: Path, out: Path, run: Run) -> None:
     found = exported(run, folder / "small.ply", out / "small.ply")
-    assert found["origin"] is None
-    assert 1e-9 < found["differences"]["center"] < 1.3e-7
+    assert found["origin"] is None and 1e-9 < found["differences"]["center"] < 1.3e-7
     baked(run, folder / "small.ply", out / "field")
     rounded = "rounded to float32, whose steps of 0.5 m there are larger than the splats (sigma 0.02 m)"
     neither(run, folder / "float.ply", out, rounded)
@@ -124,9 +127,7 @@ def _siblings_of_linear(folder: Path) -> None:
     flat: dict[str, Any] = {"scale_1": None, "scale_2": None}
     scales, rotations = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
     sigmas = dict.fromkeys(("sigma_0", "sigma_1", "sigma_2"), 0.02)
-    millimetres = plane_rows(**dict.fromkeys(scales, float(np.log(20.0))))
-    for axis in "xyz":
-        millimetres[axis] *= 1000
+    millimetres = plane_rows(unit=1000.0, **dict.fromkeys(scales, float(np.log(20.0))))
     files = {
         "alone_linear": plane_rows(scale_0=0.02, **flat),
         "alone": plane_rows(**flat, **dict.fromkeys(rotations)),  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:
     return bytes(cv2.imencode(suffix, pixels, list(options))[1])
 
 
-def chunk(kind: bytes, content: bytes) -> bytes:
+def png_chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
@@ -53,9 +53,9 @@ def test_the_head_of_a_plain_file_is_that_of_its_pixels(data: bytes, channels: i
 
 NO_SIZE = [
     b"\x89PNG\r\n\x1a\n"
-    + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-    + chunk(b"IDAT", zlib.compress(bytes(8)))
-    + chunk(b"IEND", b"")
+    + png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    + png_chunk(b"IDAT", zlib.compress(bytes(8)))
+    + png_chunk(b"IEND", b"")
     for width, height in ((0, 4), (1 << 20, 1 << 20))
 ]
 

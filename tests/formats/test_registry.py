@@ -52,5 +52,4 @@ def test_a_run_folder_is_described_by_its_first_thousand_names(tmp_path: Path) -
     for number in range(1200):
         (tmp_path / f"{number}").write_bytes(b"x")
     found = describe(tmp_path)
-    assert (found.facts["files"], found.facts["bytes"]) == (1201, 1202)
-    assert len(found.grids[0].rows) == 1000
+    assert (found.facts["files"], found.facts["bytes"], len(found.grids[0].rows)) == (1201, 1202, 1000)

@@ -45,18 +45,17 @@ def test_a_truncated_log_is_described_up_to_the_cut(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=20))
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     summary = describe(log)
-    assert summary.damaged == 1
-    assert isinstance(summary.facts["messages"], int) and 0 < summary.facts["messages"] < 20 * 4 + 21
+    assert summary.damaged == 1 and 0 < summary.facts["messages"] < 20 * 4 + 21
 
 
 def test_a_capture_and_its_index_files_are_described(tmp_path: Path) -> None:
     folder = tmp_path / "x.capture"
     write_capture(folder, open_source(make_log(tmp_path / "log.mcap")))
-    summary = describe(folder)
-    assert (summary.kind, summary.grids[0].rows) == ("capture", [["cam0", 5, "32x24", 30.0, 0.001]])
-    assert describe(folder / "frames.csv").facts["rows"] == 5
-    assert describe(folder / "joints.npz").grids[0].rows[0] == ["stamp_ns", "5", "int64"]
-    assert describe(folder / "depth/cam0/000000.png").facts["dtype"] == "uint16"
+    names = (".", "frames.csv", "joints.npz", "depth/cam0/000000.png")
+    whole, frames, joints, depth = (describe(folder / name) for name in names)
+    assert (whole.kind, whole.grids[0].rows) == ("capture", [["cam0", 5, "32x24", 30.0, 0.001]])
+    assert (frames.facts["rows"], depth.facts["dtype"]) == (5, "uint16")
+    assert joints.grids[0].rows[0] == ["stamp_ns", "5", "int64"]
 
 
 def test_a_splat_file_is_described_by_its_header(tmp_path: Path) -> None:
@@ -64,20 +63,16 @@ def test_a_splat_file_is_described_by_its_header(tmp_path: Path) -> None:
     header = "ply\nformat binary_little_endian 1.0\ncomment frame world\nelement vertex 7\n"
     properties = "".join(f"property float {name}\n" for name in ("x", "opacity", "scale_0"))
     path.write_text(f"{header}{properties}end_header\n")
-    facts = describe(path).facts
-    assert (describe(path).kind, facts["vertex"], facts["comments"]) == ("splats", 7, ["frame world"])
-    (tmp_path / "scene").mkdir()
-    path.rename(tmp_path / "scene/splats.ply")
-    assert describe(tmp_path / "scene").kind == "scene folder"
+    found = describe(path)
+    assert (found.kind, found.facts["vertex"], found.facts["comments"]) == ("splats", 7, ["frame world"])
+    assert describe(tmp_path).kind == "scene folder"
 
 
 def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> None:
     write_ply(tmp_path / "splats.ply", plain_splats([0, 0, 0], 0.01), {})
-    baked = ["--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", "0.1", "-q", "-o", str(tmp_path / "field")]
-    baked += ["--set", "field.max_loss=1", "--no-report"]
-    assert main(["sdf-bake", str(tmp_path / "splats.ply"), *baked]) == 0
+    options = ["--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", "0.1", "-q", "--set", "field.max_loss=1", "--no-report"]
+    assert main(["sdf-bake", str(tmp_path / "splats.ply"), *options, "-o", str(tmp_path / "field")]) == 0
     summary = describe(tmp_path / "field")
-    assert summary.kind == "field folder"
     expected = {
         "shape": [3, 3, 5],
         "extent_m": [0.2, 0.2, 0.4],
@@ -91,7 +86,7 @@ def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> 
         "splats_used": {"object": 1, "robot": 0, "human": 0},
         "observed": "no occupancy grid: all never seen",
     }
-    assert expected.items() <= summary.facts.items()
+    assert summary.kind == "field folder" and expected.items() <= summary.facts.items()
 
 
 def test_what_is_no_recording_is_described_by_its_head_and_what_is_not_there_refused(tmp_path: Path) -> None:
@@ -145,8 +140,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, name: str, conten
 def test_real_recordings_are_described_and_other_encodings_listed(real_data: Path) -> None:
     folder = real_data / "rosbag2_mcap_sensor_msgs"
     ros = describe(folder / "rosbag2_2025_09_10-13_03_56_0.mcap")
-    assert ros.facts["messages"] == 194
-    assert any("no depth topic" in item for item in ros.missing)
+    assert ros.facts["messages"] == 194 and any("no depth topic" in item for item in ros.missing)
     assert "no tf (/tf, /tf_static); record it, or give --camera-pose" in ros.missing
     web = describe(folder / "simple-protobuf.mcap")
     assert ({row[2] for row in web.grids[0].rows}, web.damaged) == ({"json", "protobuf"}, 0)
@@ -165,11 +159,10 @@ def test_a_scene_says_how_much_of_its_space_is_known_by_its_own_thresholds(tmp_p
     (tmp_path / "splats.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
     expected = {"never_seen": 0.25, "free": 0.375, "occupied": 0.125, "uncertain": 0.125, "swept_by_robot": 0.125}
     space: Any = describe(tmp_path).facts["space"]
-    assert space["share"] == expected
-    assert (space["extent_m"], space["robot_voxels"], space["human_voxels"]) == ([0.2, 0.2, 0.2], 1, 1)
+    found = [space[name] for name in ("share", "extent_m", "robot_voxels", "human_voxels")]
+    assert found == [expected, [0.2, 0.2, 0.2], 1, 1]
     (tmp_path / "run.json").write_text(json.dumps({"config": {"occupancy": {"free_below": 0.2}}}))
-    space = describe(tmp_path).facts["space"]
-    assert space["share"] == expected | {"free": 0.25, "uncertain": 0.25}
+    assert describe(tmp_path).facts["space"]["share"] == expected | {"free": 0.25, "uncertain": 0.25}
 
 
 def test_a_good_log_lacks_nothing_and_its_topics_come_with_count_rate_size_and_encoding(tmp_path: Path) -> None:
@@ -177,9 +170,7 @@ def test_a_good_log_lacks_nothing_and_its_topics_come_with_count_rate_size_and_e
     assert (summary.kind, summary.missing) == ("MCAP", ())
     assert (summary.facts["tf_roots"], summary.facts["joints"]) == (["world"], ["joint_a", "joint_b"])
     topics, cameras = summary.grids[:2]
-    assert cameras.rows[0][0] == "cam0"
     rows = {str(row[0]): list(row[1:]) for row in topics.rows}
-    seen = "32x24 {} in frame 'cam0_optical'"
-    depth = ["sensor_msgs/msg/Image", "cdr", 5, "10.00", seen.format("16UC1")]
-    assert rows["/cam0/depth/image_raw"] == depth
-    assert rows["/cam0/color/image_raw/compressed"][4] == seen.format("rgb8 compressed")
+    color, depth = (f"32x24 {form} in frame 'cam0_optical'" for form in ("rgb8 compressed", "16UC1"))
+    assert rows["/cam0/depth/image_raw"] == ["sensor_msgs/msg/Image", "cdr", 5, "10.00", depth]
+    assert (cameras.rows[0][0], rows["/cam0/color/image_raw/compressed"][4]) == ("cam0", color)

@@ -71,8 +71,8 @@ def test_one_gaussian_has_the_bytes_of_the_reference_layout(tmp_path: Path) -> N
     )
     write_gaussian_ply(tmp_path / "a.ply", one, {})
     lines, body = parts_of(tmp_path / "a.ply")
-    assert lines[2] == "element vertex 1"  # where readers of a fixed layout look for it
-    assert [line for line in lines if line.startswith("property")] == [f"property float {name}" for name in NAMES]
+    properties = [line for line in lines if line.startswith("property")]  # the number: where fixed layouts have it
+    assert (lines[2], properties) == ("element vertex 1", [f"property float {name}" for name in NAMES])
     red, green, blue = ([3.0 * k + channel for k in range(1, 16)] for channel in range(3))
     expected = [1, 2, 3, 0, 0, 0, 0, 1, 2, *red, *green, *blue, 0, *np.log([0.01, 0.02, 0.03]), 0.5, -0.5, 0.5, -0.5]
     np.testing.assert_allclose(struct.unpack("<62f", body), expected, rtol=1e-6)
@@ -86,8 +86,8 @@ def test_one_splat_has_the_properties_and_bytes_that_a_stock_viewer_expects(tmp_
     one = plain_splats([1, 2, 3], 0.01, colors=[0.5, 1.0, 0.0], opacities=0.5, labels=Label.HUMAN)
     write_ply(tmp_path / "a.ply", changed(one, density=[7.0]), {"source": "run 7"})
     lines, body = parts_of(tmp_path / "a.ply")
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     properties = [*(f"property float {name}" for name in STANDARD), "property uchar label", "property float density"]
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     assert [line for line in lines if line.startswith("property")] == properties
     assert {"comment frame: world", "comment units: metre", "comment source: run 7"} <= set(lines)
     half = 0.5 / 0.28209479177387814
@@ -152,8 +152,8 @@ def test_ascii_in_any_order_with_extra_properties_is_read_as_round_splats(tmp_pa
     np.testing.assert_allclose(splats.centers, [[1, 2, 3]] * 2)
     np.testing.assert_allclose(splats.radii, np.exp(-4), rtol=1e-6)
     np.testing.assert_allclose(splats.colors[0], 0.5 + 0.28209479 * np.array([0.3, 0.2, 0.1]), rtol=1e-6)
-    assert (splats.opacities.tolist(), splats.density.tolist()) == ([0.5, 0.5], [0, 0])
-    assert splats.labels.tolist() == [Label.OBJECT] * 2 and comments == {"made by hand": ""}
+    found = [getattr(splats, name).tolist() for name in ("opacities", "density", "labels")]
+    assert (found, comments) == ([[0.5, 0.5], [0, 0], [Label.OBJECT] * 2], {"made by hand": ""})
 
 
 def test_big_endian_doubles_and_other_elements_read_the_same(tmp_path: Path) -> None:
@@ -232,8 +232,8 @@ def test_a_file_that_is_damaged_or_no_ply_is_refused(
     path.write_bytes(change(path.read_bytes()))
     expect_refusal(rf"a\.ply: .*{message}", read_ply, path)
     path.unlink()
-    expect_refusal("a.ply: cannot be read: No such file", read_ply, path)
-    expect_refusal("a.ply: cannot be read: No such file", is_mesh, path)
+    for read in (read_ply, is_mesh):
+        expect_refusal("a.ply: cannot be read: No such file", read, path)
 
 
 def test_a_compressed_ply_is_refused_by_name(tmp_path: Path) -> None:
@@ -297,10 +297,9 @@ def test_open3d_finds_the_same_values(tmp_path: Path) -> None:
     gaussians = gaussian_set(30)
     write_gaussian_ply(tmp_path / "a.ply", gaussians, {})
     points = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply")).point
-    assert np.array_equal(points["positions"].numpy(), gaussians.centers)
-    assert np.array_equal(points["rot"].numpy(), gaussians.quats_wxyz)
-    assert np.array_equal(points["f_dc"].numpy(), gaussians.harmonics[:, 0])
-    assert np.array_equal(points["f_rest"].numpy(), gaussians.harmonics[:, 1:])
+    harmonics = {"f_dc": gaussians.harmonics[:, 0], "f_rest": gaussians.harmonics[:, 1:]}
+    for name, values in {"positions": gaussians.centers, "rot": gaussians.quats_wxyz, **harmonics}.items():
+        assert np.array_equal(points[name].numpy(), values), name
     np.testing.assert_allclose(points["scale"].numpy(), gaussians.scales, rtol=1e-6)
 
 

@@ -46,11 +46,9 @@ def test_the_same_set_gives_the_same_bytes_and_is_described(tmp_path: Path, kind
     paths = [tmp_path / f"{name}{kind.suffix}" for name in ("a", "b")]
     for path in paths:
         kind.write(path, gaussians, {"k": "v"})
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    assert sorted(tmp_path.iterdir()) == paths
+    assert paths[0].read_bytes() == paths[1].read_bytes() and sorted(tmp_path.iterdir()) == paths
     for summary in (describe(paths[0]), describe_splats(paths[0], b"")):
-        assert summary.kind == "splats"
-        assert 30 in (summary.facts.get("splats"), summary.facts.get("vertex"))
+        assert summary.kind == "splats" and 30 in (summary.facts.get("splats"), summary.facts.get("vertex"))
     facts = {"format": kind.name, "shape": "anisotropic", "degree_of_harmonics": 0}
     assert facts.items() <= summary.facts.items()
     np.testing.assert_allclose(np.array(summary.facts["lower_m"]), gaussians.centers.min(axis=0), atol=1e-3)
@@ -83,16 +81,14 @@ def test_what_is_no_gaussian_or_no_whole_file_is_refused_in_one_line(tmp_path: P
 def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -> None:
     gaussians = gaussian_set(2)
     gaussians.scales[0, 1] = 1e-6
-    gaussians.harmonics[1, 0, 2] = 50.0
-    gaussians.harmonics[1, 5, 0] = -3.0
+    gaussians.harmonics[1, [0, 5], [2, 0]] = 50.0, -3.0
     for suffix in (".splat", ".spz"):
         found = FORMATS[suffix]
         found.write(tmp_path / f"a{suffix}", gaussians, {})
         reduced, back = found.reduce(gaussians), found.read(tmp_path / f"a{suffix}")[0]
         assert not differences(reduced, back).beyond(found.bound(gaussians))
         assert differences(reduced, gaussians).color > 5
-    assert back.scales[0, 1] == pytest.approx(np.exp(-10), rel=1e-5)
-    assert back.harmonics[1, 5, 0] == -1.0
+    assert (back.scales[0, 1], back.harmonics[1, 5, 0]) == (pytest.approx(np.exp(-10), rel=1e-5), -1.0)
 
 
 def test_a_difference_beyond_the_bound_is_named() -> None:
@@ -115,12 +111,12 @@ def test_the_nearest_isotropic_set_keeps_volume_mean_colour_and_opacity() -> Non
 
 
 def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, splat_set(3), {})
-    path.write_bytes(path.read_bytes().replace(b"float rot_", b"float was_"))
-    assert isinstance(read_splats(path)[0], SplatSet)
+    round_splats, path = tmp_path / "round.ply", tmp_path / "a.ply"
+    write_ply(round_splats, splat_set(3), {})
     write_gaussian_ply(path, gaussian_set(3), {})
-    path.write_bytes(path.read_bytes().replace(b"float rot_", b"float was_"))
+    for file in (round_splats, path):
+        file.write_bytes(file.read_bytes().replace(b"float rot_", b"float was_"))
+    assert isinstance(read_splats(round_splats)[0], SplatSet)
     expect_refusal("missing properties rot_0 rot_1 rot_2 rot_3", read_splats, path)
 
 
@@ -145,14 +141,12 @@ def test_what_is_written_reads_back_within_a_bound_that_is_not_loose(
     back, comments = kind.read(path)
     reduced, bound = kind.reduce(gaussians), kind.bound(gaussians)
     measured = differences(reduced, back)
-    assert not measured.beyond(bound)
-    assert np.array_equal(back.labels, reduced.labels)
+    assert not measured.beyond(bound) and np.array_equal(back.labels, reduced.labels)
     assert isinstance(read_splats(path)[0], GaussianSet)
     if kind.is_rounded:
         assert degree < 3 or all(asdict(measured)[name] >= 0.7 * most for name, most in asdict(bound).items())
         return
     assert reduced is gaussians and max(asdict(bound).values()) <= 1e-4
-    assert comments["scene"] == "made up"
-    assert back.harmonics.shape[1] == (degree + 1) ** 2
+    assert (comments["scene"], back.harmonics.shape[1]) == ("made up", (degree + 1) ** 2)
     kind.write(tmp_path / "again", back, {"scene": "made up"})
     assert (tmp_path / "again").read_bytes() == path.read_bytes()

@@ -32,8 +32,7 @@ from splatctrl_cli.recording.container.log_formats import (
 )
 from splatctrl_cli.recording.container.mcap_log import McapLog
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.recording.source import describe, open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, describe, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from tests.properties import few
 from tests.recording.log.make_log import STORE, LogRecipe, make_log, messages_of, rewritten, write_bag, write_raw
@@ -56,18 +55,13 @@ def as_ros1_bag(log: Path, path: Path) -> Path:
 def assert_same(before: list[Record], after: list[Record]) -> None:
     assert len(before) == len(after) > 0
     for a, b in zip(before, after, strict=True):
-        assert a.stamp_ns == b.stamp_ns
-        if isinstance(a, RgbdFrame):
-            assert isinstance(b, RgbdFrame)
-            assert np.array_equal(a.color, b.color)
-            assert np.array_equal(a.depth, b.depth)
-            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
+        assert (type(a), a.stamp_ns) == (type(b), b.stamp_ns)
+        is_frame = isinstance(a, RgbdFrame)
+        for name in ("color", "depth", "human", "valid") if is_frame else ("position", "velocity"):
+            assert np.array_equal(getattr(a, name), getattr(b, name)), name
+        if is_frame:
             assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
-            assert np.array_equal(a.human, b.human) and np.array_equal(a.valid, b.valid)
-        else:
-            assert isinstance(b, JointState)
-            assert np.array_equal(a.position, b.position)
-            assert np.array_equal(a.velocity, b.velocity)
+            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
 
 
 FORMS: dict[str, Callable[[Path, Path], Path]] = {
@@ -152,8 +146,8 @@ WRITERS: dict[str, Callable[[Path, Written], None]] = {
 def found_in(path: Path, names: set[str] | None = None) -> tuple[Written, int]:
     """The messages, and how much was damaged."""
     damage = Damage()
-    log = open_raw_log(path)
-    return [(m.topic.name, m.log_time_ns, bytes(m.data)) for m in log.messages(damage, names)], damage.count
+    messages = open_raw_log(path).messages(damage, names)
+    return [(m.topic.name, m.log_time_ns, bytes(m.data)) for m in messages], damage.count
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -193,11 +187,9 @@ def test_a_log_is_known_by_its_first_bytes(tmp_path: Path, kind: str, suffix: st
 @pytest.mark.parametrize("content", [b"hello, this is text", b""])
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path, suffix: str, content: bytes) -> None:
-    said = (
-        f"does not begin like a {suffix} file (first bytes b'hello, t')" if content else "the file is empty (0 bytes)"
-    )
+    known = f"does not begin like a {suffix} file (first bytes b'hello, t')"
     (tmp_path / f"x{suffix}").write_bytes(content)
-    expect_refusal(said, open_raw_log, tmp_path / f"x{suffix}")
+    expect_refusal(known if content else "the file is empty (0 bytes)", open_raw_log, tmp_path / f"x{suffix}")
 
 
 @pytest.mark.parametrize(("stamps", "num_frames"), [("header", 5), ("log", 4)])
@@ -213,34 +205,26 @@ def test_a_time_beyond_64_bits_costs_its_message(tmp_path: Path, stamps: str, nu
     notes = [f"{topic}: a time beyond 2^63 ns" for topic in left[: 6 - num_frames]]
     log = rewritten(make_log(tmp_path / "log.mcap"), tmp_path / "x.mcap", late)
     source = open_source(log, SourceOptions(stamps=stamps))
-    records = list(source.records())
-    assert sum(isinstance(record, RgbdFrame) for record in records) == num_frames
-    assert len(records) == num_frames + 4  # joint states
+    kinds = [type(record) for record in source.records()]
+    assert (kinds.count(RgbdFrame), kinds.count(JointState)) == (num_frames, 4)
     assert sorted(source.loss.notes) == sorted(notes)
 
 
-NAMED = [(kind, suffix) for kind in FOREIGN for suffix in kind.suffixes]
-
-MARKED = [kind for kind in FOREIGN if kind.magic]
-
-HOLDING = [kind for kind in FOREIGN if kind.entry]
-
-
-@pytest.mark.parametrize(("kind", "suffix"), NAMED, ids=[suffix for _, suffix in NAMED])
+@pytest.mark.parametrize(("suffix", "kind"), [(suffix, kind) for kind in FOREIGN for suffix in kind.suffixes])
 def test_an_ending_names_its_format_in_either_case(tmp_path: Path, kind: Foreign, suffix: str) -> None:
     for name in (f"run{suffix}", f"run{suffix.upper()}"):
         (tmp_path / name).write_bytes(b"any content")
         assert expect_refusal(kind.what, open_source, tmp_path / name).endswith(f"; {kind.remedy}")
 
 
-@pytest.mark.parametrize("kind", MARKED, ids=lambda kind: kind.what)
+@pytest.mark.parametrize("kind", [kind for kind in FOREIGN if kind.magic], ids=lambda kind: kind.what)
 def test_first_bytes_name_a_format_under_another_ending(tmp_path: Path, kind: Foreign) -> None:
     (tmp_path / "run.dat").write_bytes(kind.magic + bytes(5000) + kind.mark)
     for read in (open_source, describe):
         expect_refusal(kind.what, read, tmp_path / "run.dat")
 
 
-@pytest.mark.parametrize("kind", HOLDING, ids=lambda kind: kind.what)
+@pytest.mark.parametrize("kind", [kind for kind in FOREIGN if kind.entry], ids=lambda kind: kind.what)
 def test_an_entry_names_a_folder_or_a_zip_file(tmp_path: Path, kind: Foreign) -> None:
     (tmp_path / "run" / kind.entry).mkdir(parents=True)
     with zipfile.ZipFile(tmp_path / "run.bin", "w") as archive:

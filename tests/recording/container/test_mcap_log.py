@@ -76,9 +76,11 @@ def test_a_cut_gives_the_whole_messages_of_the_chunk_it_cuts(tmp_path: Path, com
     data = small_log(compression, num=60, size=20_000)  # chunks of 200 kB: more than one block of zstd and lz4
     place = chunk_places(tmp_path / "x.mcap", data)[3]
     found, damage = read(tmp_path / "x.mcap", data[: place + 180_000])
-    assert found == list(range(1, len(found) + 1))
+    assert (found, damage.notes) == (
+        list(range(1, len(found) + 1)),
+        [f"x.mcap: cut or damaged after byte {place}"],
+    )
     assert len(found) > 30 + 3, "the three chunks before the cut hold ten each; more are in the cut one"
-    assert damage.notes == [f"x.mcap: cut or damaged after byte {place}"]
 
 
 @pytest.mark.parametrize("has_summary", [True, False])
@@ -93,13 +95,11 @@ def test_a_chunk_whose_length_is_wrong_costs_itself_alone(tmp_path: Path, has_su
 
 
 def test_a_hole_of_zeros_costs_what_it_covers(tmp_path: Path) -> None:
-    data = bytearray(small_log())
-    path = tmp_path / "x.mcap"
+    data, path = bytearray(small_log()), tmp_path / "x.mcap"
     _, second, third, _ = chunk_places(path, data)
     data[second - 40 : third - 30] = bytes(third - second + 10)
     found, damage = read(path, bytes(data))
-    assert found == [*range(1, 11), *range(21, 41)]
-    assert damage.count >= 1
+    assert found == [*range(1, 11), *range(21, 41)] and damage.count >= 1
 
 
 @pytest.mark.parametrize(
@@ -114,10 +114,8 @@ def test_a_hole_of_zeros_costs_what_it_covers(tmp_path: Path) -> None:
 def test_each_checksum_is_checked(tmp_path: Path, mark: bytes, num: int, note: str) -> None:
     data = bytearray(small_log(CompressionType.NONE))
     data[data.rindex(mark)] ^= 1
-    (tmp_path / "x.mcap").write_bytes(data)
-    damage = Damage()
-    assert len(list(McapLog(tmp_path / "x.mcap").messages(damage))) == num
-    assert any(note in said for said in damage.notes)
+    found, damage = read(tmp_path / "x.mcap", bytes(data))
+    assert len(found) == num and any(note in said for said in damage.notes)
 
 
 START = MAGIC + struct.pack("<BQII", 0x01, 8, 0, 0)  # a header without names
@@ -162,21 +160,20 @@ HOSTILE: dict[
 
 
 def test_unknown_records_are_passed_over(tmp_path: Path) -> None:
-    data = small_log()
-    path = tmp_path / "x.mcap"
+    data, path = small_log(), tmp_path / "x.mcap"
     place = chunk_places(path, data)[0]
     alien = b"".join(struct.pack("<BQ", opcode, 5) + b"alien" for opcode in (0x10, 0x7F, 0x80, 0xFF))
     found, damage = read(path, data[:place] + alien + data[place:])
-    assert found == list(range(1, 41))
-    assert [note[-7:] for note in damage.notes[:1]] == ["differs"], "the checksum of the data section knows"
+    # the checksum of the data section differs
+    assert (found, [note[-7:] for note in damage.notes[:1]]) == (list(range(1, 41)), ["differs"])
 
 
 def test_notes_of_damage_are_bounded_and_their_count_is_not() -> None:
     damage = Damage()
     for index in range(1000):
         damage.add(f"note {index}")
-    assert damage.count == 1000
-    assert damage.notes[-2:] == [f"note {MAX_NOTES - 1}", f"and {1000 - MAX_NOTES} more"]
+    said = [f"note {MAX_NOTES - 1}", f"and {1000 - MAX_NOTES} more"]
+    assert (damage.count, damage.notes[-2:]) == (1000, said)
 
 
 READ = """
@@ -231,8 +228,7 @@ def test_checksums_are_compared_once_and_again_where_the_file_has_changed(
     os.utime(path, ns=(1, 1))
     for _ in range(2):
         damage = Damage()
-        assert len(list(log.messages(damage))) < 40
-        assert "checksum differs" in damage.notes[0]
+        assert len(list(log.messages(damage))) < 40 and "checksum differs" in damage.notes[0]
     again = McapLog(path)
     assert next(again.messages(Damage())).log_time_ns == 1, "a pass that was not finished says nothing of checksums"
     assert len(list(again.messages(Damage()))) < 40
@@ -240,10 +236,9 @@ def test_checksums_are_compared_once_and_again_where_the_file_has_changed(
 
 def test_a_log_whose_damage_took_what_is_missing_says_so(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(chunk_size=1))  # a chunk a message, tf first
-    data = bytearray(log.read_bytes())
-    for chunk in McapFile(log).chunk_indexes()[:1]:
-        data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 0xFF
-    log.write_bytes(bytes(data))
+    data, chunk = bytearray(log.read_bytes()), McapFile(log).chunk_indexes()[0]
+    data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 0xFF
+    log.write_bytes(data)
     expected = r"no tf .*; but the log is damaged: .*chunk.*; copy the file again; if this is all there is: "
     expect_refusal(expected, open_source, log, SourceOptions(world_frame="world"))
 
@@ -332,12 +327,10 @@ def test_every_conformance_file_reads_as_its_json_says(real_data: Path, group: s
     assert files
     for file in files:
         damage = Damage()
-        found = [as_json(record) for record in records_of(file, damage)]
         records = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["records"]
         expected = [record for record in records if record["type"] in KINDS]
         assert len(expected) >= 2  # the end of the data and a footer
-        assert found == expected, file.name
+        assert [as_json(record) for record in records_of(file, damage)] == expected, file.name
         messages = [dict(record["fields"]) for record in records if record["type"] == "Message"]
         given = [(_value(m.data), str(m.log_time_ns)) for m in McapLog(file).messages(damage)]
-        assert given == [(m["data"], m["log_time"]) for m in messages], file.name
-        assert damage.all_notes == [], file.name
+        assert (given, damage.all_notes) == ([(m["data"], m["log_time"]) for m in messages], []), file.name

@@ -1,7 +1,6 @@
 """Depth that was recorded as 16-bit PNG comes into a capture byte for byte, where nothing has to change it."""
 
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE, IMAGE, Message
 from splatctrl_cli.recording.log.messages import read_image
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.records import Intrinsics, JointState
+from tests.formats.test_image_file import png_chunk
 from tests.plain import plain_frame
 from tests.recording.log.make_log import HEIGHT, WIDTH, LogRecipe, built, encoded, frames_of, make_log, rewritten
 from tests.refused import expect_refusal
@@ -70,16 +70,13 @@ BESIDE = LogRecipe(depth_frame="cam0_depth")  # of another camera
 def test_recorded_png_depth_is_kept_without_its_head_unless_the_lens_is_undone_or_it_is_registered(
     tmp_path: Path, recipe: LogRecipe, form: str, head: bytes
 ) -> None:
-    log, files = with_png_depth(tmp_path, recipe, form=form, head=head)
-    capture = tmp_path / "x.capture"
+    (log, files), capture = with_png_depth(tmp_path, recipe, form=form, head=head), tmp_path / "x.capture"
     write_capture(capture, open_source(log))
     kept = [path.read_bytes() for path in sorted((capture / "depth" / "cam0").iterdir())]
-    assert len(files) == len(kept) == 5
-    assert (kept == files) == (recipe == LogRecipe())
+    assert (len(files), len(kept), kept == files) == (5, 5, recipe == LogRecipe())
     raw, of_log, of_capture = (frames_of(path) for path in (tmp_path / "raw.mcap", log, capture))
     for a, b, c in zip(raw, of_log, of_capture, strict=True):
-        assert a.depth.shape == (HEIGHT, WIDTH) and not a.depth.all()
-        assert np.array_equal(a.depth, b.depth)
+        assert a.depth.shape == (HEIGHT, WIDTH) and not a.depth.all() and np.array_equal(a.depth, b.depth)
         assert np.abs(b.depth - c.depth).max() <= (1e-6 if recipe.depth_frame else 0)
 
 
@@ -106,8 +103,8 @@ def test_a_file_that_cannot_be_kept_costs_its_frame(tmp_path: Path, wrong: str, 
 def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp_path: Path) -> None:
     head = struct.pack(">IIBBBBB", WIDTH, HEIGHT, 16, 0, 0, 0, 0)
     parts = [(b"IHDR", head), (b"IDAT", b"no deflated stream"), (b"IEND", b"")]
-    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in parts]
-    source = open_source(with_png_depth(tmp_path, change={2: b"\x89PNG\r\n\x1a\n" + b"".join(chunks)})[0])
+    file = b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*part) for part in parts)
+    source = open_source(with_png_depth(tmp_path, change={2: file})[0])
     frames = [item for item in source.stored() if not isinstance(item, JointState)]
     said = "/cam0/depth/image_raw#2: compressed image .* not an image file; copy"
     expect_refusal(said, lambda: frames[2].frame)

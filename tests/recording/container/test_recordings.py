@@ -8,8 +8,7 @@ import pytest
 
 from splatctrl_cli.recording.container.log_formats import is_bag_folder
 from splatctrl_cli.recording.log.stored_frame import StoredFrame
-from splatctrl_cli.recording.source import describe, open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, describe, open_source
 from tests.conftest import ROOT
 from tests.refused import expect_refusal
 
@@ -68,10 +67,8 @@ def test_a_recording_is_read(real_data: Path, recording: Recording) -> None:
     if recording.example:
         path, options = EXAMPLES / f"{recording.example}.toml", SourceOptions(root=path)
     cameras, stored = first_stored(path, options)
-    frame = stored.frame
-    low, high = recording.depth_share
-    assert cameras == recording.cameras
-    assert (frame.intrinsics.width, frame.intrinsics.height) == recording.size
+    frame, (low, high) = stored.frame, recording.depth_share
+    assert (cameras, (frame.intrinsics.width, frame.intrinsics.height)) == (recording.cameras, recording.size)
     assert frame.color.shape[:2] == frame.depth.shape == recording.size[::-1]
     assert low < (frame.depth > 0).mean() <= high
 

@@ -102,9 +102,8 @@ def test_camera_files_hold_world_to_camera_in_millimetres_and_pairs_the_nearest_
     expected = invert_transform(VIEWS[1].T_world_camera)
     np.testing.assert_allclose(extrinsic[:3, :3], expected[:3, :3], atol=1e-9)
     np.testing.assert_allclose(extrinsic[:3, 3], expected[:3, 3] * 1000, atol=1e-5)
-    lines = (scan / "Cameras/pair.txt").read_text().splitlines()
-    assert lines[0] == "4"
-    assert ["".join(line.split()[1::2]) for line in lines[2::2]] == ["123", "023", "130", "210"]
+    num, *lines = (scan / "Cameras/pair.txt").read_text().splitlines()
+    assert (num, ["".join(line.split()[1::2]) for line in lines[1::2]]) == ("4", ["123", "023", "130", "210"])
 
 
 FULL = np.array([[2892.3, 0, 823.2], [0, 2883.2, 619.1], [0, 0, 1]])
@@ -154,8 +153,7 @@ def test_full_cameras_and_depth_are_halved_and_cropped(scan: Path) -> None:
     found = resized(scan, (640, 512), "00000000_cam.txt", FULL, FULL_DEPTH)
     k = found.intrinsics
     assert (k.fx, k.cx, k.cy) == pytest.approx((1446.15, 331.6, 265.55))
-    assert found.depth.shape == (512, 640)
-    np.testing.assert_allclose(found.depth[10, 20] * 1000, FULL_DEPTH[2 * (10 + 44), 2 * (20 + 80)], rtol=1e-6)
+    np.testing.assert_allclose(found.depth * 1000, FULL_DEPTH[88 : 88 + 1024 : 2, 160 : 160 + 1280 : 2], rtol=1e-6)
 
 
 def test_cameras_and_depth_of_the_full_size_fit_images_made_smaller(scan: Path) -> None:
@@ -229,8 +227,8 @@ def test_damage_of_a_scan_of_mvsnet_is_named(scan: Path, damage: Damage, message
 
 
 def in_unit_sphere(folder: Path) -> None:
-    matrices = dict(np.load(folder / "cameras_sphere.npz"))
-    np.savez(folder / "cameras_sphere.npz", **matrices | {"scale_mat_0": np.eye(4)})
+    file = folder / "cameras_sphere.npz"
+    np.savez(file, **dict(np.load(file)) | {"scale_mat_0": np.eye(4)})
 
 
 @pytest.mark.parametrize(
@@ -264,7 +262,6 @@ def test_a_projection_of_any_scale_gives_the_camera_back(scale: float) -> None:
     matrix, T_world_camera = decompose(scale * projection(VIEWS[1])[:3], "test")
     np.testing.assert_allclose(matrix, [[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(T_world_camera, VIEWS[1].T_world_camera, atol=1e-12)
-    assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
     said = "world_mat_2: expected a camera's projection, got a matrix that cannot be"
     expect_refusal(said, decompose, np.ones((3, 4)), "world_mat_2")
 
@@ -272,20 +269,18 @@ def test_a_projection_of_any_scale_gives_the_camera_back(scale: float) -> None:
 def test_a_missing_image_leaves_the_others_their_cameras_and_masks(idr: Path) -> None:
     (idr / "image/000001.png").unlink()
     scan = read_idr(idr)
-    assert scan.numbers == (0, 2, 3)
     np.testing.assert_allclose(scan.views[1].T_world_camera, VIEWS[2].T_world_camera, atol=1e-9)
     np.testing.assert_array_equal(scan.views[1].mask, VIEWS[2].mask)
     np.testing.assert_allclose(scan.views[1].depth, VIEWS[2].depth, rtol=1e-6)
     (idr / "mask/001.png").unlink()
-    assert read_idr(idr).numbers == (0, 2, 3)
+    assert scan.numbers == read_idr(idr).numbers == (0, 2, 3)
 
 
 def test_without_depth_a_view_of_idr_stays_and_depth_maps_may_lie_elsewhere(tmp_path: Path, scan: Path) -> None:
     shutil.rmtree(write_idr(tmp_path / "plain", "scan7", VIEWS) / "depth")
     source = DtuSource(tmp_path / "plain")
-    assert not source.has_depth
-    assert len(frames_of(source)) == 4
-    assert source.loss.notes[0] == "000000.png: without depth"
+    found = len(frames_of(source)), source.has_depth, source.loss.notes[0]
+    assert found == (4, False, "000000.png: without depth")
     assert DtuSource(tmp_path / "plain", depths=scan / DEPTHS).has_depth
     expect_refusal(
         r"nowhere: expected depth_map_0000.pfm", DtuSource, tmp_path / "plain", depths=tmp_path / "nowhere"
@@ -311,10 +306,9 @@ def test_held_out_views_are_a_camera_of_their_own_and_stamps_are_view_numbers(sc
 
 def test_a_view_of_mvsnet_without_depth_is_left_out_and_the_others_keep_their_numbers(scan: Path) -> None:
     (scan / DEPTHS / "depth_map_0001.pfm").unlink()
-    source = DtuSource(scan, None, [2])
+    source, said = DtuSource(scan, None, [2]), "rect_002_3_r5000.png: without depth, left out"
     assert places(source) == [("camera", 0), ("holdout", 2), ("camera", 3)]
-    assert source.loss.unpaired_color == 1
-    assert source.loss.notes == ["rect_002_3_r5000.png: without depth, left out"]
+    assert (source.loss.unpaired_color, source.loss.notes) == (1, [said])
     expect_refusal(r"--holdout 1: .* has no such view; views: 0, 2, 3", DtuSource, scan, None, [1], error=UsageError)
 
 
@@ -322,11 +316,10 @@ def test_a_view_made_smaller_sees_the_same_points_at_the_same_places() -> None:
     color = np.zeros((48, 64, 3), np.uint8)
     color[8:12, 20:24] = 200
     full = replace(VIEWS[0], color=color, mask=color[:, :, 0] > 0)
-    small = shrink_view(full, 4)
-    assert small.color.shape == (12, 16, 3)
-    assert small.color[2, 5, 0] == 200
-    assert small.color.sum() == 3 * 200
-    assert np.argwhere(small.mask).tolist() == [[2, 5]]
+    small, expected = shrink_view(full, 4), np.zeros((12, 16, 3))
+    expected[2, 5] = 200
+    np.testing.assert_array_equal(small.color, expected)
+    np.testing.assert_array_equal(small.mask, expected[:, :, 0] > 0)
     center_of_patch = np.array([[21.5, 9.5]])
     point = np.column_stack([(center_of_patch - [K.cx, K.cy]) / [K.fx, K.fy], [1.0]])
     np.testing.assert_allclose(project(full.intrinsics, point), center_of_patch)

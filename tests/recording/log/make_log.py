@@ -21,8 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import SourceOptions
+from splatctrl_cli.recording.source import SourceOptions, open_source
 from splatctrl_cli.records import RecordSource, RgbdFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -204,8 +203,6 @@ class LogRecipe:
     tf_last: bool = False
     tf_frames: int | None = None
     tf_delay_ns: int = 0
-    is_bigendian: bool = False
-    step_padding: int = 0
     distortion: tuple[float, ...] = (0.0,) * 5
     color_name: str = "image_raw"
     projection_focal: float = 0.0
@@ -260,7 +257,6 @@ def _transforms(recipe: LogRecipe) -> Iterator[Content]:
 def _frame(recipe: LogRecipe, index: int) -> Iterator[Content]:
     stamp = START_NS + index * FRAME_NS
     late = stamp + recipe.depth_delay_ns
-    form = {"big": recipe.is_bigendian, "padding": recipe.step_padding}
     for camera in recipe.cameras:
         optical = f"{camera}_optical"
         frame = recipe.depth_frame or optical
@@ -269,11 +265,11 @@ def _frame(recipe: LogRecipe, index: int) -> Iterator[Content]:
             yield stamp, f"/{camera}/color/camera_info", _info(recipe, stamp, optical, (WIDTH, HEIGHT))
         if recipe.has_depth:
             pixels = _depth(recipe, index)
-            yield late, f"/{camera}/depth/image_raw", image(late, frame, recipe.depth_encoding, pixels, **form)
+            yield late, f"/{camera}/depth/image_raw", image(late, frame, recipe.depth_encoding, pixels)
         if recipe.has_depth and recipe.depth_frame is not None:
             yield stamp, f"/{camera}/depth/camera_info", _info(recipe, stamp, frame, recipe.depth_size)
         if recipe.mask_every and index % recipe.mask_every == 0:
-            yield late, f"/{camera}/people/mask", image(late, optical, "mono8", mask_pixels(index), **form)
+            yield late, f"/{camera}/people/mask", image(late, optical, "mono8", mask_pixels(index))
     if recipe.has_joints:
         moved = {"name": ["joint_a", "joint_b"], "position": [0.1 * index, -0.1 * index], "velocity": [1.0, -1.0]}
         yield stamp, "/joint_states", built(JOINT_STATE, header=header(stamp), **moved)
@@ -287,8 +283,7 @@ def _color(recipe: LogRecipe, topic: str, stamp: int, frame: str, index: int) ->
     turned = pixels[..., ::-1] if form.startswith("bgr") else pixels
     alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
     forms = {"rgba8": np.dstack([turned, alpha]), "bgra8": np.dstack([turned, alpha]), "mono8": pixels[..., 1]}
-    odd = {"big": recipe.is_bigendian, "padding": recipe.step_padding}
-    return topic, image(stamp, frame, form, forms.get(form, turned), **odd)
+    return topic, image(stamp, frame, form, forms.get(form, turned))
 
 
 def _depth(recipe: LogRecipe, index: int) -> np.ndarray[Any, Any]:

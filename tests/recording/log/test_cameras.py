@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,8 +14,8 @@ from splatctrl_cli.recording.log.decoder import CAMERA_INFO, COMPRESSED_IMAGE, I
 from splatctrl_cli.recording.log.messages import DEPTH, ImageMessage, word_of
 from splatctrl_cli.recording.log.messages import OTHERS as OTHER_WORDS
 from splatctrl_cli.recording.log.survey import Calibration, Survey, TopicSurvey
-from splatctrl_cli.recording.source import open_source
-from splatctrl_cli.recording.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.recording.source import CameraTopics, SourceOptions, open_source
+from tests.cases.container_cases import jpeg_of
 from tests.recording.log.make_log import LogRecipe, Message, broken_log, built, make_log, messages_of, write_raw
 from tests.refused import expect_refusal
 
@@ -172,9 +171,7 @@ def test_a_topic_says_depth_or_something_else_or_nothing(name: str) -> None:
 def _as_jpeg(log_ns: int, topic: str, kind: str, message: Any) -> list[Message]:
     if topic != "/cam0/depth/image_raw":
         return [(log_ns, topic, kind, message)]
-    counts = np.frombuffer(message.data.tobytes(), "<u2").reshape(message.height, message.width)
-    data = cv2.imencode(".jpg", (counts >> 4).astype(np.uint8))[1]
-    packed = built(COMPRESSED_IMAGE, header=message.header, format="jpeg", data=data)
+    packed = built(COMPRESSED_IMAGE, header=message.header, format="jpeg", data=jpeg_of(message))
     return [(log_ns, f"{topic}/compressed", packed.__msgtype__, packed)]
 
 

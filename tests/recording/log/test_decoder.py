@@ -55,10 +55,8 @@ def test_a_definition_that_cannot_be_used_is_refused(name: str) -> None:
 
 
 def test_a_known_name_with_other_fields_is_refused() -> None:
-    text = T_TEXT.replace("Time stamp", "Time sent")
-    assert text != T_TEXT
     with pytest.raises(UndecodableMessageError, match="std_msgs/msg/Header lacks the field stamp of the standard"):
-        MessageDecoder().decode(message(text, type_name=JOINT_STATE))
+        MessageDecoder().decode(message(T_TEXT.replace("Time stamp", "Time sent"), type_name=JOINT_STATE))
     content = bytes(STORE.serialize_cdr(built(JOINT_STATE, name=["a"], position=[0.0]), JOINT_STATE))
     assert MessageDecoder().decode(message(T_TEXT, content, JOINT_STATE)).name == ["a"]
 
@@ -72,11 +70,11 @@ def test_a_refused_definition_is_not_compiled_again(monkeypatch: pytest.MonkeyPa
     assert compiled.call_count == 1
 
 
-def test_a_sequence_that_announces_more_than_there_is_costs_the_message() -> None:
-    for kind in ("uint8", "float64", "string", "builtin_interfaces/Time"):
-        data = b"\x00\x01\x00\x00" + struct.pack("<I", 0xFFFFFFFF) + bytes(60)
-        with pytest.raises(UndecodableMessageError):
-            MessageDecoder().decode(message(f"{kind}[] x", data))
+@pytest.mark.parametrize("kind", ["uint8", "float64", "string", "builtin_interfaces/Time"])
+def test_a_sequence_that_announces_more_than_there_is_costs_the_message(kind: str) -> None:
+    data = b"\x00\x01\x00\x00" + struct.pack("<I", 0xFFFFFFFF) + bytes(60)
+    with pytest.raises(UndecodableMessageError):
+        MessageDecoder().decode(message(f"{kind}[] x", data))
 
 
 def image_message(**fields: Any) -> RawMessage:
@@ -116,8 +114,8 @@ def test_an_alien_schema_costs_one_topic(tmp_path: Path) -> None:
     source = open_source(with_alien)
     assert len(list(source.records())) == len(list(open_source(log).records())) == 10
     assert source.loss.damaged == describe(with_alien).damaged == 0  # a definition that cannot be used is no damage
-    (note,) = source.loss.notes
-    assert note.startswith("/alien:") and "is not usable" in note and "(3 times)" in note
+    parts = ("/alien:", "is not usable", "(3 times)")
+    assert [all(part in note for part in parts) for note in source.loss.notes] == [True]
 
 
 COUNTS = np.array([[0, 1, 500], [1000, 40000, 65534]], dtype=np.uint16)
@@ -177,5 +175,4 @@ def test_what_an_idl_schema_includes_and_does_not_hold_is_named_and_no_damage() 
     found, image = Survey(), replace(topic, type_name=COMPRESSED_IMAGE)
     for _ in range(3):
         add_message(found, MessageDecoder(), RawMessage(topic=image, log_time_ns=0, data=bytes(32)))
-    assert found.damage.count == 0
-    assert [note.endswith("(3 times)") for note in found.damage.all_notes] == [True]
+    assert (found.damage.count, [note[-9:] for note in found.damage.all_notes]) == (0, ["(3 times)"])

@@ -13,6 +13,7 @@ import pytest
 from splatctrl_cli.formats.image_file import decode_file
 from splatctrl_cli.recording.log.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
 from splatctrl_cli.recording.log.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
+from tests.formats.test_image_file import png_chunk
 from tests.recording.log.make_log import header, image
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
@@ -43,8 +44,7 @@ def test_color_encodings_give_the_same_rgb(encoding: str, pixels: np.ndarray[Any
 @pytest.mark.parametrize("padding", [0, 4])
 def test_integer_depth_is_millimetres_in_either_byte_order(encoding: str, big: bool, padding: int) -> None:
     read = of_image(encoding, COUNTS, big=big, padding=padding)
-    assert read.kind == "depth"
-    assert depth_of(read, None) == pytest.approx(COUNTS * 1e-3, rel=1e-6)
+    assert (read.kind, depth_of(read, None)) == ("depth", pytest.approx(COUNTS * 1e-3, rel=1e-6))
     assert depth_of(read, 1e-4) == pytest.approx(COUNTS * 1e-4, rel=1e-6)
 
 
@@ -53,8 +53,7 @@ def test_float_depth_is_metres_and_what_was_not_measured_is_zero() -> None:
     read = of_image("32FC1", values)
     assert np.array_equal(depth_of(read, None), wanted) and np.array_equal(depth_of(read, 0.5), wanted / 2)
     tiff = of_file("32FC1; tiff compressed ", packed(".tiff", np.where(np.isfinite(values), values, 0)))
-    assert (tiff.kind, tiff.compressed) == ("depth", None)
-    assert np.array_equal(depth_of(tiff, None), wanted)
+    assert (tiff.kind, tiff.compressed, depth_of(tiff, None).tolist()) == ("depth", None, wanted.tolist())
     counts = np.uint16([[1000, 65535], [0, 65534]])  # a D415 and an OAK write 65535 where they measured nothing
     assert depth_of(of_image("16UC1", counts), None) == pytest.approx(np.float32([[1, 0], [0, 65.534]]), rel=1e-6)
     assert num_invalid(counts) == 1
@@ -123,7 +122,6 @@ EXPECTED = np.array([1.164 * (Y - 16) + 1.596 * (V - 128), 1.164 * (Y - 16) - 0.
 )
 def test_yuv_422_is_read_in_either_order(encoding: str, four: tuple[int, ...]) -> None:
     rgb = color_of(of_image(encoding, np.tile(np.array(four, np.uint8).reshape(1, 2, 2), (4, 3, 1)), padding=2))
-    assert rgb.shape == (4, 6, 3)
     assert rgb[..., :2] == pytest.approx(np.broadcast_to(EXPECTED, (4, 6, 2)), abs=1.5)
 
 
@@ -151,12 +149,13 @@ def test_planar_yuv_is_read_with_the_rows_of_colour_behind_those_of_grey(
 
 @pytest.mark.parametrize("lazily", [False, True])
 def test_float_depth_of_the_compressed_transport_is_inverse_depth(lazily: bool) -> None:
-    a, b = 100.0, 2.0
-    depth = np.where(COUNTS > 2, a / (COUNTS.astype(np.float64) - b), 0)
-    data = struct.pack("<iff", 0, a, b) + packed(".png", COUNTS).tobytes()
+    depth = np.where(COUNTS > 2, 100.0 / (COUNTS.astype(np.float64) - 2.0), 0)
+    data = struct.pack("<iff", 0, 100.0, 2.0) + packed(".png", COUNTS).tobytes()
     read = of_file("32FC1; compressedDepth png", data, lazily=lazily)
-    assert depth_of(read, None) == pytest.approx(depth, rel=1e-6)
-    assert read.compressed is None  # its counts are no depth
+    assert (depth_of(read, None), read.compressed) == (
+        pytest.approx(depth, rel=1e-6),
+        None,
+    )  # its counts are no depth
 
 
 FORMS = [  # of image_transport's plugins, as the distributions write them, and of drivers
@@ -194,8 +193,7 @@ def test_every_form_of_a_compressed_image_is_told_apart(form: str, suffix: str, 
 def test_colour_png_of_sixteen_bits_or_with_alpha_keeps_bytes_that_decode_alike(lazily: bool) -> None:
     for pixels in (DEEP[..., ::-1], np.dstack([BGR, RGB[..., 0]])):
         read = of_file("png", packed(".png", pixels), lazily=lazily)
-        assert np.array_equal(color_of(read), RGB)
-        assert read.compressed is not None
+        assert np.array_equal(color_of(read), RGB) and read.compressed is not None
         assert np.array_equal(np.asarray(decode_file(read.compressed, color=True)), RGB)
     with pytest.raises(UndecodableMessageError, match="pixels of float64, neither colour nor depth"):
         of_file("64FC1; tiff compressed ", packed(".tiff", np.ones((4, 4), np.float64)), lazily=lazily)
@@ -222,16 +220,11 @@ def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_me
     png = bytes(cv2.imencode(".png", np.zeros((64, 64), np.uint16))[1])
     assert decode_file(png, color=False) is not None  # a flat image, packed as well as can be
     head = struct.pack(">II", 30_000, 30_000) + png[24:29]
-    bomb = png[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + png[33:]
+    bomb = png[:8] + png_chunk(b"IHDR", head) + png[33:]
     assert decode_file(png + b"behind the end", color=False) is not None
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
-    assert decode_file(bomb, color=False) is None
-    assert decode_file(png[:20] + png[-12:], color=False) is None
+    assert decode_file(bomb, color=False) is None and decode_file(png[:20] + png[-12:], color=False) is None
     assert decode_file(png[:33] + b"\x7f" + png[34:], color=False) is None  # a chunk of two gigabytes
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 @pytest.mark.parametrize("lazily", [False, True])
@@ -241,15 +234,14 @@ def test_a_png_with_a_palette_a_gamma_or_interlaced_rows_has_the_values_that_are
     """
 
     def png(colors: int, passes: int, data: bytes, *more: bytes) -> bytes:
-        head = chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, colors, 0, 0, passes))
-        return (
-            b"\x89PNG\r\n\x1a\n" + head + b"".join(more) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
-        )
+        head = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, colors, 0, 0, passes))
+        parts = (head, *more, png_chunk(b"IDAT", zlib.compress(data)), png_chunk(b"IEND", b""))
+        return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
     rows = [RGB[0, columns].tobytes() for columns in ([0], [4], [2], [1, 3, 5])]
     for data in (
-        png(3, 0, bytes([0, *range(6)]), chunk(b"PLTE", RGB[0].tobytes())),
-        png(2, 0, b"\0" + RGB[0].tobytes(), chunk(b"gAMA", struct.pack(">I", 100_000))),
+        png(3, 0, bytes([0, *range(6)]), png_chunk(b"PLTE", RGB[0].tobytes())),
+        png(2, 0, b"\0" + RGB[0].tobytes(), png_chunk(b"gAMA", struct.pack(">I", 100_000))),
         png(2, 1, b"".join(b"\0" + row for row in rows)),
     ):
         assert np.array_equal(color_of(of_file("png", data, lazily=lazily)), RGB[:1])

@@ -1,4 +1,6 @@
-"""Logs as records: what a good log gives, what each kind of bad log says, and how little of a large one is read."""
+"""Logs as records: what a good log gives, what each kind of bad log says, how little of a large one is read; images
+that wait for others, in memory and in a file; and pairs by stamp.
+"""
 
 import struct
 from collections.abc import Iterator
@@ -11,12 +13,15 @@ import pytest
 from splatctrl_cli.recording.container.log_formats import open_raw_log
 from splatctrl_cli.recording.container.mcap_file import DATA_END, McapFile
 from splatctrl_cli.recording.container.mcap_log import McapLog
-from splatctrl_cli.recording.container.raw_log import Damage
+from splatctrl_cli.recording.container.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.recording.log import ros_log
 from splatctrl_cli.recording.log import survey as surveys
-from splatctrl_cli.recording.log.survey import survey
+from splatctrl_cli.recording.log.ros_log import HeldMessages, RosLogSource, planned_images
+from splatctrl_cli.recording.log.survey import pair_images, survey
 from splatctrl_cli.recording.source import CameraTopics, SourceOptions, describe, open_source
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.scene.keyframes import make_view
+from tests.recording.container.test_log_formats import assert_same
 from tests.recording.log.make_log import (
     FRAME_NS,
     HEIGHT,
@@ -29,6 +34,8 @@ from tests.recording.log.make_log import (
     frames_of,
     make_log,
     mask_pixels,
+    messages_of,
+    write_raw,
 )
 from tests.refused import expect_refusal
 
@@ -44,14 +51,13 @@ def test_a_good_log_gives_every_frame_and_joint_state_whole(tmp_path: Path) -> N
     for index, (frame, state) in enumerate(zip(frames, joints, strict=True)):
         assert isinstance(frame, RgbdFrame) and isinstance(state, JointState)
         assert state.stamp_ns == frame.stamp_ns == START_NS + index * FRAME_NS
-        assert state.position == pytest.approx([0.1 * index, -0.1 * index])
-        assert state.velocity == pytest.approx([1.0, -1.0])
+        assert [*state.position, *state.velocity] == pytest.approx([0.1 * index, -0.1 * index, 1.0, -1.0])
         assert np.array_equal(frame.color, color_pixels(index))
         assert frame.human is None, "nobody asked for masks"
         assert (frame.depth[0, 0], frame.depth[5, 7]) == (0, np.float32(1.25))
         assert frame.T_world_camera[:3, 3] == pytest.approx([camera_x(index), 0, 0.5])
-        assert (frame.intrinsics.width, frame.intrinsics.height) == (WIDTH, HEIGHT)
-        assert (frame.intrinsics.fx, frame.intrinsics.cx) == (30.0, 15.5)
+        k = frame.intrinsics
+        assert (k.width, k.height, k.fx, k.cx) == (WIDTH, HEIGHT, 30.0, 15.5)
 
 
 def test_a_world_frame_inside_the_tree_is_honoured_and_one_camera_of_several_chosen(tmp_path: Path) -> None:
@@ -72,9 +78,12 @@ def test_images_without_partner_or_outside_the_time_of_tf_are_counted(
     tmp_path: Path, recipe: LogRecipe, num_frames: int, lost: tuple[int, int, int]
 ) -> None:
     source = open_source(make_log(tmp_path / "log.mcap", recipe))
-    assert len(frames_of(source)) == num_frames
-    assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == lost
-    assert source.loss.damaged == 0
+    found, loss = len(frames_of(source)), source.loss
+    assert (found, loss.unpaired_color, loss.unpaired_depth, loss.without_pose, loss.damaged) == (
+        num_frames,
+        *lost,
+        0,
+    )
 
 
 def test_unregistered_depth_is_warped_through_tf_and_both_lenses(tmp_path: Path) -> None:
@@ -97,7 +106,7 @@ def test_a_distorted_lens_is_undone_on_colour_and_depth(tmp_path: Path) -> None:
     frame = frames_of(log, MASKED)[0]
     k, (column, seen) = frame.intrinsics, seen_through((15.5, 11.5), 30.0)
     assert (k.fx, k.fy, k.cx, k.cy) == (30.0, 30.0, 15.5, 11.5)  # the lens's own
-    assert frame.valid is not None and np.array_equal(frame.valid, seen) and not seen[0, 0]
+    assert np.array_equal(frame.valid, seen) and not seen[0, 0]
     green = np.interp(column, np.arange(WIDTH), color_pixels(0)[0, :, 1])
     assert frame.color[seen, 1] == pytest.approx(green[seen], abs=1.0)
     assert (frame.color[seen, 0] == 40).all() and not frame.color[~seen].any()
@@ -112,10 +121,9 @@ def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Pa
         color_name="image_rect_color", color_format="rgb8", distortion=(0.4, 0, 0, 0, 0), projection_focal=28.0
     )
     frame = frames_of(make_log(tmp_path / "log.mcap", recipe))[0]
-    assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (28.0, 16.0, 12.0)
-    assert np.array_equal(frame.color, color_pixels(0))
     seen = seen_through((16.0, 12.0), 28.0)[1]
-    assert frame.valid is not None and np.array_equal(frame.valid, seen)
+    assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (28.0, 16.0, 12.0)
+    assert np.array_equal(frame.color, color_pixels(0)) and np.array_equal(frame.valid, seen)
     assert 0.5 < seen.mean() < 1.0 and not make_view(frame, frame.depth > 0).target.counted[~seen].any()
 
 
@@ -275,3 +283,63 @@ def test_an_index_counts_what_a_survey_counts(
     assert {name: topic.count for name, topic in found.topics.items()} == expected
     assert any("has no summary" in note for note in notes) != has_summary
     assert describe(path).missing == ()
+
+
+TOPIC = Topic(name="/a", type_name="t", encoding="cdr")
+
+TWO = LogRecipe(cameras=("cam0", "cam1"), mask_every=2)
+
+
+@pytest.mark.parametrize("held_bytes", [0, 1000, 1 << 20])
+def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
+) -> None:
+    monkeypatch.setattr(ros_log, "HELD_BYTES", held_bytes)
+    log = make_log(tmp_path / "log.mcap", TWO)
+    apart = write_raw(tmp_path / "apart.mcap", sorted(messages_of(log), key=lambda m: m.topic.name))
+    assert_same(list(open_source(log).records()), list(open_source(apart).records()))
+
+
+def test_the_plan_takes_few_bytes_a_frame_and_lets_images_go_that_none_needs_any_more(tmp_path: Path) -> None:
+    log, held = make_log(tmp_path / "log.mcap", TWO), HeldMessages()
+    source = open_source(log)
+    assert isinstance(source, RosLogSource)
+    plan = source._plan
+    assert plan._columns.nbytes == 48 * len(plan) == 48 * 10
+    assert [planned.stamp_ns for planned in plan] == sorted(planned.stamp_ns for planned in plan)
+    assert [planned.camera.name for planned in plan][:4] == ["cam0", "cam1"] * 2
+    assert {topic: int(counts.sum()) for topic, counts in plan.uses().items()} == {
+        f"/cam{i}/{name}": 5 for i in range(2) for name in ("color/image_raw/compressed", "depth/image_raw")
+    }
+    most = [len(held._messages) for _ in planned_images(source._log, plan, Damage(), held)]
+    assert len(most) == 10 and max(most) <= 4 and most[-1] == 0
+    named = [SourceOptions(cameras=names) for names in (("cam0", "cam1"), ("cam1", "cam0"))]
+    orders = [[(s, c) for s, c, _ in open_source(log, options).poses()] for options in named]
+    assert orders[0] == orders[1] == sorted(orders[0]), "by stamp, then camera, in whatever order these are named"
+
+
+def test_held_messages_come_back_and_memory_holds_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_log, "HELD_BYTES", 100)
+    held = HeldMessages()
+    data = [bytes([i]) * 40 for i in range(10)]
+    for i, content in enumerate(data):
+        held.add(("/a", i), RawMessage(topic=TOPIC, log_time_ns=i, data=content))
+    assert sum(len(message.data) for message in held._messages.values()) == 80
+    for i in (9, 0, 5, 5, 1, 2, 3):
+        assert held.get(("/a", i)) == RawMessage(topic=TOPIC, log_time_ns=i, data=data[i])
+    for i in range(10):
+        assert held.pop(("/a", i)).data == data[i] and ("/a", i) not in held
+    held.add(("/a", 10), RawMessage(topic=TOPIC, log_time_ns=0, data=bytes(100)))
+    assert not held._places  # what went has made room
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_pairs_are_those_of_every_pair_tried_in_turn(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    color, depth = (random.integers(0, 200, random.integers(0, 40)).tolist() for _ in range(2))
+    tolerance, expected = int(random.integers(0, 30)), dict[int, int]()
+    for gap, _, _, i, j in sorted((abs(a - b), a, b, i, j) for i, a in enumerate(color) for j, b in enumerate(depth)):
+        if gap <= tolerance and i not in expected and j not in expected.values():
+            expected[i] = j
+    pairs = sorted(expected.items(), key=lambda pair: (color[pair[0]], pair[0]))
+    assert [(i, j) for i, j in pair_images(color, depth, tolerance).tolist()] == pairs

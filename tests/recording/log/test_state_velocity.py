@@ -32,8 +32,7 @@ def test_jitter_of_sending_is_smoothed_out_of_a_fixed_rate() -> None:
     position, truth = np.sin(2 * t)[:, None], 2 * np.cos(2 * t)[:, None]
     error = np.abs(differentiate(sent, position) - truth)
     raw = np.abs(np.gradient(position[:, 0], (sent - sent[0]) * 1e-9)[:, None] - truth)
-    assert error.max() < 0.04
-    assert np.median(error) < np.median(raw) / 10
+    assert error.max() < 0.04 and np.median(error) < np.median(raw) / 10
 
 
 def test_nothing_is_fitted_across_a_gap() -> None:
@@ -58,10 +57,8 @@ def test_a_velocity_of_zero_is_believed_of_a_joint_that_stands_still_only() -> N
     position = np.stack([np.arange(50) * 0.01, np.full(50, 0.3)], axis=1)
     loss = LossReport()
     assert clean_states(track(position, 0.0), loss)[20].velocity == pytest.approx([1.0, 0.0])
-    assert loss.differentiated_velocities == 50
-    assert loss.notes == [
-        "log: velocities of a are zero throughout although they move; they are differences of the positions"
-    ]
+    said = "log: velocities of a are zero throughout although they move; they are differences of the positions"
+    assert (loss.differentiated_velocities, loss.notes) == (50, [said])
 
 
 def test_recorded_velocities_are_kept_and_other_units_are_said() -> None:

@@ -62,10 +62,9 @@ def q_at(i: int) -> Float64:
 def test_libfranka_logs_of_both_kinds_are_read(tmp_path: Path, is_new: bool, is_commanded: bool) -> None:
     source = opened(libfranka_log(tmp_path / "x.csv", is_new=is_new, is_commanded=is_commanded), ARM)
     found = states(source)
-    assert source.joint_names == ARM
-    assert [s.stamp_ns for s in found] == [(5000 + i) * 1_000_000 for i in range(20)]
-    assert found[3].position == pytest.approx(q_at(3))
-    assert found[3].velocity == pytest.approx(np.arange(1.0, 8))
+    stamps = [(5000 + i) * 1_000_000 for i in range(20)]
+    assert (source.joint_names, [s.stamp_ns for s in found]) == (ARM, stamps)
+    assert [*found[3].position, *found[3].velocity] == pytest.approx([*q_at(3), *range(1, 8)])
     wanted = 0.5 if is_commanded else 0.25  # without a command the desired velocity stands for it
     assert found[3].commanded_velocity == pytest.approx(np.full(7, wanted))
     assert any("since it was switched on" in note for note in source.loss.notes)
@@ -83,12 +82,13 @@ def test_an_end_effector_pose_that_a_program_added_is_read_by_columns(tmp_path: 
 
 def test_a_csv_of_no_known_kind_asks_for_a_description_and_a_cut_line_is_named(tmp_path: Path) -> None:
     path = libfranka_log(tmp_path / "x.csv")
-    path.write_text(path.read_text()[:-100])
-    assert f"{path}:21: expected" in refusal(path)
-    path.write_text("time,success_rate,q[0]\n")
-    assert "expected joint states, got none" in refusal(path)
-    path.write_text("t,j1\n0,1\n")
-    expect_refusal("expected libfranka's columns.*describe the columns in a .toml", opened, path)
+    for text, said in (
+        (path.read_text()[:-100], f"{path}:21: expected"),
+        ("time,success_rate,q[0]\n", "expected joint states, got none"),
+        ("t,j1\n0,1\n", "expected libfranka's columns.*describe the columns in a .toml"),
+    ):
+        path.write_text(text)
+        expect_refusal(said, opened, path, has_remedy=True)
 
 
 DESCRIPTION: dict[str, Any] = {
@@ -123,10 +123,9 @@ def test_degrees_milliseconds_and_an_epoch_become_radians_and_nanoseconds(tmp_pa
     said = {"velocity": ["va", "vb"], "commanded_velocity": ["vb", "va"], "epoch_ns": epoch}
     found = states(described(tmp_path, **said, pose=poses, pose_frame="world"))
     assert [s.stamp_ns for s in found] == [epoch + 10_000_000 * i for i in range(20)]
-    assert found[7].position == pytest.approx(np.radians([0.7, -0.7]))
-    assert found[7].velocity == pytest.approx(np.radians([10, -10]))
-    assert found[7].commanded_velocity == pytest.approx(np.radians([-10, 10]))
-    assert found[7].T_base_ee is None and found[7].T_world_ee is not None
+    motion = [*found[7].position, *found[7].velocity, *found[7].commanded_velocity]
+    assert motion == pytest.approx(np.radians([0.7, -0.7, 10, -10, -10, 10]))
+    assert found[7].T_base_ee is None
     assert found[7].T_world_ee[:3] == pytest.approx(np.array([[0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0.5]]))
     source = opened(described(tmp_path))
     assert states(source)[0].velocity == pytest.approx(np.radians([10, -10])), "differences where not described"
@@ -165,28 +164,30 @@ def test_a_wrong_description_names_the_key(tmp_path: Path, changes: dict[str, An
     assert said in refusal(described(tmp_path, **changes))
 
 
-def test_a_cell_that_is_no_number_is_named(tmp_path: Path) -> None:
-    (tmp_path / "run.csv").write_text("t,qa,qb\n0,0,0\n10,zero,0\n")
-    assert "run.csv:3: column qa: expected a number, got 'zero'" in refusal(described(tmp_path))
-    (tmp_path / "run.csv").write_text("t,qa,qb\n0,0,0\nnan,0,0\n")
-    assert "run.csv:3: column t: expected a number, got 'nan'" in refusal(described(tmp_path))
-    (tmp_path / "run.csv").write_text("t,qa,qb\n\n0,0,0\n\n10,zero,0\n")
-    assert "run.csv:5: column qa: expected a number, got 'zero'" in refusal(described(tmp_path))
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("0,0,0\n10,zero,0\n", "run.csv:3: column qa: expected a number, got 'zero'"),
+        ("0,0,0\nnan,0,0\n", "run.csv:3: column t: expected a number, got 'nan'"),
+        ("\n0,0,0\n\n10,zero,0\n", "run.csv:5: column qa: expected a number, got 'zero'"),
+    ],
+)
+def test_a_cell_that_is_no_number_is_named(tmp_path: Path, rows: str, said: str) -> None:
+    (tmp_path / "run.csv").write_text(f"t,qa,qb\n{rows}")
+    assert said in refusal(described(tmp_path))
 
 
 def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
-    np.savez(tmp_path / "run.npz", t=np.arange(3.0), q=np.zeros((3, 2)))
-    path = described(tmp_path, file="run.npz", position=["angles"])
-    assert "'angles': expected an array of numbers, got none; arrays there: t, q" in refusal(path)
-    for t in (np.array([0.0, np.nan, 1.0]), np.array([0, "NaT", 2], "datetime64[ns]")):
-        np.savez(tmp_path / "run.npz", t=t, q=np.zeros((3, 2)))
-        assert "t: expected times, got NaN, NaT" in refusal(described(tmp_path, file="run.npz", position=["q"]))
-    np.savez(tmp_path / "run.npz", t=np.zeros(0), q=np.zeros((0, 2)))
-    assert "q: expected rows, got none; record it again" in refusal(
-        described(tmp_path, file="run.npz", position=["q"])
-    )
+    for t, name, said in (
+        (np.arange(3.0), "angles", "'angles': expected an array of numbers, got none; arrays there: t, q"),
+        (np.array([0.0, np.nan, 1.0]), "q", "t: expected times, got NaN, NaT"),
+        (np.array([0, "NaT", 2], "datetime64[ns]"), "q", "t: expected times, got NaN, NaT"),
+        (np.zeros(0), "q", "q: expected rows, got none; record it again"),
+    ):
+        np.savez(tmp_path / "run.npz", t=t, q=np.zeros((len(t), 2)))
+        assert said in refusal(described(tmp_path, file="run.npz", position=[name]))
     (tmp_path / "run.npz").write_bytes(b"PK no")
-    assert "cannot be read as NPZ" in refusal(path)
+    assert "cannot be read as NPZ" in refusal(tmp_path / "run.toml")
 
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
