@@ -49,6 +49,14 @@ def renderer() -> Iterator[None]:
     yield
 
 
+def points_on(triangles: Float64, num: int, rng: np.random.Generator) -> Float64:
+    """Points (num, 3) on triangles (N, 3, 3), by area."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    chosen = rng.choice(len(triangles), num, p=area / area.sum())
+    return np.asarray(np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), num), triangles[chosen]))
+
+
 def test_nothing_of_the_judge_imports_the_tool() -> None:
     for path in PACKAGE.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -61,17 +69,12 @@ def test_nothing_of_the_judge_imports_the_tool() -> None:
 def test_a_distance_is_that_of_the_nearest_of_many_surface_points(solid: Solid) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.35, 0.35, (25, 3))
-    triangles = as_piece(solid).triangles
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    chosen = rng.choice(len(triangles), 200_000, p=area / area.sum())
-    surface = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), triangles[chosen])
+    surface = points_on(as_piece(solid).triangles, 200_000, rng)
     nearest = np.array([np.linalg.norm(surface - point, axis=1).min() for point in points])
     distance, slope = signed_distance(solid, points)
     np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-3)
-    step = 1e-6
-    for axis in range(3):
-        shift = step * np.eye(3)[axis]
-        change = (signed_distance(solid, points + shift)[0] - signed_distance(solid, points - shift)[0]) / (2 * step)
+    for axis, shift in enumerate(1e-6 * np.eye(3)):
+        change = (signed_distance(solid, points + shift)[0] - signed_distance(solid, points - shift)[0]) / 2e-6
         assert np.median(np.abs(change - slope[:, axis])) < 1e-6
 
 
@@ -94,7 +97,9 @@ def test_clearance_agrees_with_a_dense_sample_and_with_mujoco(name: str) -> None
     seen, _ = world.clearances(np.zeros(1), q)
     poses = Cell(robot, (), ()).link_poses(q)
     for column, solid in enumerate(solids):
-        points = np.concatenate([moved(poses[link][0], _sampled(body, rng)) for link, body in world.seen().items()])
+        points = np.concatenate(
+            [moved(poses[link][0], points_on(body.triangles, 12_000, rng)) for link, body in world.seen().items()]
+        )
         near = signed_distance(solid, moved(inverse(solid.track.poses[0]), points))[0].min()
         assert -1e-4 <= min(near, 0.3) - seen.per[0, column] < 2.5e-3, (solid.name, near, seen.per[0, column])
     assert mujoco_difference(world, 0.0, q[0]) < 2e-4
@@ -118,23 +123,21 @@ def test_what_moves_with_the_robot_is_robot_and_not_an_obstacle() -> None:
     assert during == pytest.approx(0.06, abs=1e-3)
 
 
-def test_the_truth_is_that_of_the_recordings_that_others_made(real_data: Path) -> None:
-    for name, model in (
-        ("panda_shelf_real", "panda"),
-        ("ur5_near60_ideal", "ur5"),
-        ("panda_near60_ideal", "panda_tight"),
-    ):
-        folder = real_data / "mujoco" / name
-        with np.load(folder / "truth.npz") as known:
-            solids = [
-                _theirs(entry, known["t_pose"], known[f"pose_{entry['name']}"])
-                for entry in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["objects"]
-                if entry["kind"] != "mesh"
-            ]
-            rows = slice(0, None, 20)
-            world = World(robot=load_robot(model), solids=tuple(solids))
-            ours = world.clearances(known["t"][rows], known["q"][rows])[0].least
-            assert np.abs(ours - np.minimum(known["visual"][rows], 0.3)).max() < 5e-4
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("panda_shelf_real", "panda"), ("ur5_near60_ideal", "ur5"), ("panda_near60_ideal", "panda_tight")],
+)
+def test_the_truth_is_that_of_the_recordings_that_others_made(real_data: Path, name: str, model: str) -> None:
+    folder = real_data / "mujoco" / name
+    with np.load(folder / "truth.npz") as known:
+        solids = [
+            _theirs(entry, known["t_pose"], known[f"pose_{entry['name']}"])
+            for entry in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["objects"]
+            if entry["kind"] != "mesh"
+        ]
+        t, q, visual = (known[column][::20] for column in ("t", "q", "visual"))
+    ours = World(robot=load_robot(model), solids=tuple(solids)).clearances(t, q)[0].least
+    assert np.abs(ours - np.minimum(visual, 0.3)).max() < 5e-4
 
 
 def test_exact_depth_lies_on_the_true_surfaces(renderer: None) -> None:
@@ -148,23 +151,22 @@ def test_exact_depth_lies_on_the_true_surfaces(renderer: None) -> None:
     image = studio.image(camera, [0])
     is_robot = studio.is_robot(camera)
     studio.close()
-    v, u = np.nonzero((image.depth > 0) & ~is_robot)
-    z = image.depth[v, u] * COUNT
-    points = moved(
-        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
-    )
+
+    def seen(which: np.ndarray) -> Float64:
+        """Points [m] of pixels with depth."""
+        v, u = np.nonzero((image.depth > 0) & which)
+        z = image.depth[v, u] * COUNT
+        rays = np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
+        return moved(camera.T_parent_camera, rays)
+
+    points = seen(~is_robot)
     away = np.min([np.abs(signed_distance(s, moved(inverse(s.track.poses[0]), points))[0]) for s in solids], axis=0)
     assert len(points) > 200_000
     assert np.quantile(away, 0.95) < 5e-4
-    v, u = np.nonzero((image.depth > 0) & is_robot)
-    z = image.depth[v, u] * COUNT
-    points = moved(
-        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
-    )
+    points = seen(is_robot)
     pieces = {link: Body.of(found) for link, found in robot.visual.items() if found}
     poses = cell.link_poses(q[None])
-    chosen = points[:: len(points) // 60]
-    for point in chosen:
+    for point in points[:: len(points) // 60]:
         ball = Solid(name="point", kind="ball", size=(0.0,), track=fixed(pose(point)))
         assert clearance_of(pieces, poses, [ball], np.zeros(1)).least[0] < 6e-4
 
@@ -208,8 +210,7 @@ def test_a_laser_mixes_depths_at_an_edge() -> None:
 
 
 def test_aligned_depth_of_a_plane_is_the_plane() -> None:
-    depth = np.full((480, 640), 1.2)
-    assert set(np.unique(aligned(depth, LENS))) == {1200}
+    assert set(np.unique(aligned(np.full((480, 640), 1.2), LENS))) == {1200}
     square = np.zeros((480, 640))
     square[230:250, 310:330] = 1.0
     v, u = np.nonzero(aligned(square, LENS))
@@ -256,14 +257,6 @@ def test_a_recording_is_whole_and_the_same_twice(
     assert main(["info", str(folder / said["log"]), "--json"]) == 0
     shown = capsys.readouterr().out
     assert all(camera in shown for camera in said["cams"])
-
-
-def _sampled(body: Body, rng: np.random.Generator) -> Float64:
-    """Points on triangles, by area."""
-    a, b, c = np.moveaxis(body.triangles, 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(a), 12_000, p=area / area.sum())
-    return np.asarray(np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), body.triangles[chosen]))
 
 
 def _theirs(entry: dict[str, object], times: Float64, rows: Float64) -> Solid:
