@@ -12,7 +12,7 @@ import pytest
 from splatctrl_cli.checks import limits
 from splatctrl_cli.config import Config, fixed, load_config
 from splatctrl_cli.config.load import resolved_settings, template_of, toml_of
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from tests.refused import expect_refusal
 
 
@@ -90,12 +90,11 @@ def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
     ],
 )
 def test_files_that_are_missing_or_no_toml_are_named(
-    tmp_path: Path, text: str | None, error: type[Exception], words: str
+    tmp_path: Path, text: str | None, error: type[SplatCtrlError], words: str
 ) -> None:
     if text is not None:
         (tmp_path / "my.toml").write_text(text)
-    with pytest.raises(error, match=words):
-        load_config(tmp_path / "my.toml", [])
+    expect_refusal(words, load_config, tmp_path / "my.toml", [], error=error)
 
 
 @pytest.mark.parametrize(
@@ -133,8 +132,7 @@ def test_every_key_is_declared_with_a_reason_and_a_range_around_its_default(name
 
 @pytest.mark.parametrize("module", [fixed, limits])
 def test_every_fixed_number_says_what_it_decides(module: ModuleType) -> None:
-    source = inspect.getsource(module)
-    told = re.findall(r"^(\w+) = .*?  # \S", source, re.MULTILINE)
+    told = re.findall(r"^(\w+) = .*?  # \S", inspect.getsource(module), re.MULTILINE)
     assert told == [name for name in vars(module) if name.isupper()]
 
 
