@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.arrays import npy_of
@@ -181,21 +182,29 @@ def test_a_package_path_that_leaves_its_package_is_refused(tmp_path: Path) -> No
         expect_refusal("lies outside its package", mesh_path, package / "x.urdf", replace(mesh, filename=name))
 
 
-def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:
-    for array in (
+@pytest.mark.parametrize(
+    "array",
+    [
         np.arange(6, dtype="<f4").reshape(2, 3),
         np.asfortranarray(np.arange(6).reshape(2, 3)),
         np.zeros(0),
-    ):
-        stream = io.BytesIO()
-        np.save(stream, array)
-        assert np.array_equal(npy_of(stream.getvalue()), array)
-        with pytest.raises(ValueError, match="announces"):
-            npy_of(stream.getvalue() + b"x")
-    with pytest.raises(ValueError, match="announces 4398046511104 bytes, holds 64"):
-        npy_of(npy(HUGE))
-    with pytest.raises(ValueError, match="objects"):
-        npy_of(npy((1,), "|O"))
+    ],
+)
+def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further(array: NDArray[np.generic]) -> None:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    assert np.array_equal(npy_of(stream.getvalue()), array)
+    with pytest.raises(ValueError, match="announces"):
+        npy_of(stream.getvalue() + b"x")
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [(npy(HUGE), "announces 4398046511104 bytes, holds 64"), (npy((1,), "|O"), "objects")],
+)
+def test_a_npy_file_of_more_than_it_holds_or_of_objects_is_not_read(data: bytes, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        npy_of(data)
 
 
 RUN_LINES = """
