@@ -1,7 +1,6 @@
 """``splatctrl score``: of one scene, and of several scans."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from splatctrl_cli.evaluate.score import other_scans
 from splatctrl_cli.recording.folder.dtu import read_dtu
 from splatctrl_cli.recording.folder.idr import write_idr
 from splatctrl_cli.records import LossReport
-from tests.cli import here
 from tests.jobs.score.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
 from tests.recording.folder.make_layout import half_size
 
@@ -52,16 +50,6 @@ def test_free_space_is_printed_and_gated(scored: Path, capsys: pytest.CaptureFix
     assert run(scored, "--require", "free_mass<=0.1") == 1
     out = capsys.readouterr().out
     assert "of the splats' mass is in space observed free" in out and "in front" in out
-
-
-def test_a_scene_that_cannot_be_compared_prints_one_line(
-    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES[:2]))
-    assert run(scored, "--json") == 5
-    done = capsys.readouterr()
-    assert "no view of cam3 to score" in here.checked(done.out, 5)["error"]["message"]
-    assert len([line for line in done.err.splitlines() if line.startswith("splatctrl: ")]) == 1
 
 
 HOLDOUT = ("--protocol", "holdout:0")
@@ -136,12 +124,6 @@ def test_a_scan_without_a_scene_and_a_gate_that_fails_are_named(
     printed, said = capsys.readouterr()
     assert "score: GATE FAILED (1 view of 1 scan): --require psnr_masked>=90: psnr_masked is " in printed
     assert "GATE FAILED" not in said, "once"
-
-
-def test_a_scene_of_another_scan_is_refused(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(place / "scenes" / "scan8", tmp_path / "scan21")
-    assert main(["score", str(tmp_path), "--dtu", str(place / "idr"), *HOLDOUT, "-q"]) == 4
-    assert "not the recording that" in capsys.readouterr().err
 
 
 def test_scans_that_are_not_those_of_the_published_mean_are_named() -> None:
