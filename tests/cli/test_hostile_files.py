@@ -28,6 +28,7 @@ from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.folder.make_layout import make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.refused import expect_refusal
+from tests.robot.shapes import written
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
@@ -58,8 +59,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def xml(folder: Path, text: str) -> list[str]:
-    (folder / "x.urdf").write_text(text)
-    return ["robot", "info", "--urdf", str(folder / "x.urdf")]
+    return ["robot", "info", "--urdf", str(written(folder, text, "x.urdf"))]
 
 
 def images(folder: Path, name: str, depth: bytes) -> list[str]:
@@ -70,8 +70,8 @@ def images(folder: Path, name: str, depth: bytes) -> list[str]:
     (folder / "t.log").write_text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     frames = f'[frames]\ncolor = "rgb/*.png"\ndepth = "depth/*.{name}"\n[depth]\nscale = 1e-3\n'
     poses = '[poses]\nformat = "trajectory-log"\nfile = "t.log"\n'
-    (folder / "x.toml").write_text(f'root = "."\n{CAMERA}{frames}{poses}')
-    return ["ingest", str(folder / "x.toml"), "-o", str(folder / "x.capture")]
+    described = written(folder, f'root = "."\n{CAMERA}{frames}{poses}', "x.toml")
+    return ["ingest", str(described), "-o", str(folder / "x.capture")]
 
 
 def saved(path: Path, data: bytes) -> list[str]:
@@ -91,8 +91,7 @@ def states(folder: Path, shape: tuple[int, ...]) -> list[str]:
     """A table of joint states of really packed zeros."""
     write_zeros(folder / "x.npz", {"t": ((shape[0],), "<f8"), "q": (shape, "<f8")})
     table = '[states]\nfile = "x.npz"\njoints = ["a", "b"]\ntime = "t"\nposition = "q"\n'
-    (folder / "x.toml").write_text(table)
-    return ["check", str(folder / "x.toml")]
+    return ["check", str(written(folder, table, "x.toml"))]
 
 
 BLOATED = (  # a header of no pixels, then a chunk that announces 0x77000000 bytes

@@ -19,6 +19,7 @@ from splatctrl_cli.simulate.arm import (
 )
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import distance_to
+from tests.robot.shapes import written
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +94,7 @@ def test_the_committed_robot_files_are_what_the_code_writes(plain_arm: Path) -> 
 def test_visual_shapes_lie_3_mm_inside_of_collision_shapes_and_a_twentieth_27_to_30_mm(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
-    urdf = read_urdf(tmp_path / "robot.urdf")
+    urdf = read_urdf(written(tmp_path, arm_urdf(SLIM)))
     seen, gaps, areas = visual_urdf(urdf), [], []
     for link in SHAPES:
         outer, inner = ([shape for shape in of.shapes if shape.link == link] for of in (urdf, seen))
@@ -125,10 +125,9 @@ def area_of(shape: Shape) -> float:
 
 
 def test_the_slim_arm_collides_as_the_other_does(arm: RobotModel, tmp_path: Path) -> None:
-    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
     slim, same, shapes = (
         [(s.link, s.kind, s.size) for s in urdf.shapes]
-        for urdf in (read_urdf(tmp_path / "robot.urdf"), visual_urdf(arm.urdf), arm.urdf)
+        for urdf in (read_urdf(written(tmp_path, arm_urdf(SLIM))), visual_urdf(arm.urdf), arm.urdf)
     )
     assert slim == same == shapes
 

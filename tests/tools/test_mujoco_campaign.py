@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.robot.shapes import written
 from tools.mujoco.campaign import (
     BATCH,
     Machinery,
@@ -197,9 +198,8 @@ VERDICT = {
 def test_an_answer_is_a_verdict_a_refusal_or_a_crash(
     tmp_path: Path, exit_code: int | None, cause: str, document: dict[str, Any], expected: tuple[str, str]
 ) -> None:
-    (tmp_path / "audit.json").write_text(json.dumps(document))
     node = Node(state="failed", exit_code=exit_code, cause=cause, sentence="last line", seconds=1.0)
-    answer = read_answer(node, tmp_path / "audit.json")
+    answer = read_answer(node, written(tmp_path, json.dumps(document), "audit.json"))
     assert (answer.outcome, answer.reason) == expected
 
 
@@ -359,9 +359,8 @@ def test_the_truth_of_the_recordings_at_hand_is_read_and_named_in_a_suite(real_d
         document = json.loads((case / "truth.json").read_text())
         spheres = folder / f"example-robot-data/robots/{document['robot']}_spheres.yaml"
         paths = {"log": str(case / "log.mcap"), "urdf": str(folder / document["urdf"]), "spheres": str(spheres)}
-        own = tmp_path / case.name
-        own.mkdir()
-        (own / "truth.json").write_text(json.dumps({**document, **paths, "family": "shared", "index": 0}))
+        text = json.dumps({**document, **paths, "family": "shared", "index": 0})
+        own = written(tmp_path / case.name, text, "truth.json").parent
         (own / "truth.npz").symlink_to(case / "truth.npz")
         recording = read_recording(own, own)
         truth = read_truth(own, None)
