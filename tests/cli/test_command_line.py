@@ -146,9 +146,10 @@ def test_help_prints_a_page(words: str, page: str, capsys: pytest.CaptureFixture
 
 
 def test_help_prints_the_settings_and_names_the_nearest_page_for_a_wrong_word() -> None:
-    shown, template = (splatctrl(*words).stdout for words in (["help", "settings"], ["config", "--template"]))
-    assert shown.split("[scene]\n")[1].strip() == template.split("[scene]\n")[1].strip()
-    assert "--intrinsics" in splatctrl("help", "info").stdout
+    done = [splatctrl(*words.split()) for words in ("help settings", "config --template", "help info")]
+    shown, template, info = (each.stdout for each in done)
+    assert {each.returncode for each in done} == {0} and "--intrinsics" in info
+    assert shown.split("[scene]\n", 1)[1].strip() == template.split("[scene]\n", 1)[1].strip()
     assert_refused(splatctrl("help", "replays"), 2, "splatctrl: help: no page 'replays'; did you mean replay?\n")
 
 
