@@ -60,8 +60,7 @@ def test_every_list_of_a_registry_is_what_make_docs_writes_now() -> None:
     pages: dict[str, str] = generate.pages()
     for name, text in pages.items():
         assert (ROOT / "docs" / name).read_text(encoding="utf-8") == text, f"{name}: run: make docs"
-    filled = {name for text in pages.values() for _, name, _ in generate.ROWS.findall(text)}
-    assert filled == {*generate.LISTS}
+    assert {name for text in pages.values() for _, name, _ in generate.ROWS.findall(text)} == {*generate.LISTS}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -101,12 +100,10 @@ def options_in(text: str) -> set[str]:
 
 def of_experiments() -> set[str]:
     """The options of ``python -m experiments``."""
-    options: set[str] = set()
+    parser = argparse.ArgumentParser(conflict_handler="resolve")
     for experiment in EXPERIMENTS.values():
-        parser = argparse.ArgumentParser()
         experiment.add_options(parser)
-        options |= {*parser._option_string_actions}
-    return options
+    return {*parser._option_string_actions}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -135,24 +132,22 @@ def names_in(path: Path) -> set[str]:
     text = path.read_text(encoding="utf-8")
     if path.suffix != ".py":
         return set(re.findall(r"^[^\s#/}].*?\b(\w+)\(", text, flags=re.MULTILINE))
-    names = set()
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.add(node.name)
-        if isinstance(node, ast.ClassDef):
-            names |= {f"{node.name}.{item.name}" for item in node.body if isinstance(item, ast.FunctionDef)}
-    return names
+    defined = [node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    methods = {
+        f"{node.name}.{item.name}"
+        for node in defined
+        if isinstance(node, ast.ClassDef)
+        for item in node.body
+        if isinstance(item, ast.FunctionDef)
+    }
+    return methods | {node.name for node in defined}
 
 
 def test_every_place_that_the_paper_page_names_exists() -> None:
     found = list(places())
     assert len(found) > 100
-    missing = [
-        f"{path.relative_to(ROOT)}: {name}"
-        for path, name in found
-        if not path.is_file() or (name and name not in names_in(path))
-    ]
-    assert missing == []
+    names = {path: names_in(path) | {""} for path, _ in found if path.is_file()}
+    assert [f"{path.relative_to(ROOT)}: {name}" for path, name in found if name not in names.get(path, ())] == []
 
 
 def test_every_setting_that_the_paper_page_names_can_be_given() -> None:
@@ -200,20 +195,16 @@ def anchors_on(page: Path) -> set[str]:
     return set(anchors)
 
 
-def broken_links(page: Path) -> list[str]:
-    """The links of a page whose file, or whose heading in it, is not there."""
-    broken = []
-    for link in links_on(page):
-        file, _, heading = link.partition("#")
-        target = page.parent / file if file else page
-        if not target.exists() or (heading and heading not in anchors_on(target)):
-            broken.append(link)
-    return broken
+def is_broken(page: Path, link: str) -> bool:
+    """The file of a page's link, or the heading in it, is not there."""
+    file, _, heading = link.partition("#")
+    target = page.parent / file if file else page
+    return not target.exists() or bool(heading and heading not in anchors_on(target))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_leads_to_a_file_and_a_heading_that_are_there(page: Path) -> None:
-    assert broken_links(page) == []
+    assert [link for link in links_on(page) if is_broken(page, link)] == []
 
 
 def test_the_index_leads_to_every_page_and_the_pages_to_every_picture_and_table() -> None:
@@ -321,8 +312,7 @@ def test_the_first_page_shows_what_info_prints(
     command, lines = commands_on(EXAMPLE)[0], shown_after(EXAMPLE)[0]
     assert main(shlex.split(command)) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert len(lines) == 5
-    assert [line for line in lines if line not in printed] == []
+    assert (len(lines), [line for line in lines if line not in printed]) == (5, [])
 
 
 FORMATS = ROOT / "docs" / "formats.md"

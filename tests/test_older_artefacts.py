@@ -6,11 +6,20 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.cli.here import splatctrl
+
+
+def answer_of(*words: object) -> dict[str, Any]:
+    """The object that a command prints, which succeeds."""
+    told = splatctrl(*words, "--json")
+    assert told.returncode == 0, told.stderr
+    answer: dict[str, Any] = json.loads(told.stdout)
+    return answer
 
 
 @pytest.mark.parametrize(
@@ -23,22 +32,17 @@ from tests.cli.here import splatctrl
     ],
 )
 def test_an_older_artefact_is_described(older: Path, artefact: str, said: dict[str, object]) -> None:
-    told = splatctrl("info", older / artefact, "--json")
-    assert told.returncode == 0, told.stderr
-    answer = json.loads(told.stdout)
+    answer = answer_of("info", older / artefact)
     assert said.items() <= answer.items(), answer
 
 
 def test_an_older_capture_and_scene_replay_as_they_did(older: Path, tmp_path: Path) -> None:
     robot = ["--urdf", older / "robot.urdf", "--spheres", older / "robot_spheres.yaml"]
-    told = splatctrl(
+    answer = answer_of(
         "replay", older / "tabletop.capture", "--scene", older / "scene", "--mode", "open-loop", *robot,
-        "--worst-frames", "0", "--report-only", "--json", "-o", tmp_path / "replay",
+        "--worst-frames", "0", "--report-only", "-o", tmp_path / "replay",
     )  # fmt: skip
-    assert told.returncode == 0, told.stderr
-    answer = json.loads(told.stdout)
-    assert answer["min_clearance"] == pytest.approx(0.0158572, abs=1e-6)
-    assert answer["num_states"] == 51
+    assert (answer["min_clearance"], answer["num_states"]) == (pytest.approx(0.0158572, abs=1e-6), 51)
     then, now = (commands(folder / "steps.csv") for folder in (older / "audit", tmp_path / "replay"))
     np.testing.assert_allclose(now, then, rtol=0, atol=1e-6)
 
@@ -53,18 +57,13 @@ def commands(steps: Path) -> list[list[float]]:
 
 
 def test_an_older_field_is_baked_anew_rather_than_updated(older: Path, tmp_path: Path) -> None:
-    words = ["sdf-bake", older / "scene", "--at", "0.6", "--json", "-o", tmp_path / "f"]
-    told = splatctrl(*words, "--update", older / "field")
+    words = ["sdf-bake", older / "scene", "--at", "0.6", "-o", tmp_path / "f"]
+    told = splatctrl(*words, "--update", older / "field", "--json")
     assert (told.returncode, "of 0.1.0; bake it once without --update" in told.stderr) == (2, True)
-    told = splatctrl(*words)
-    assert told.returncode == 0, told.stderr
-    assert json.loads(told.stdout)["distance"] == "safe"
+    assert answer_of(*words)["distance"] == "safe"
 
 
 def test_an_older_scene_is_scored_on_an_older_capture(older: Path, tmp_path: Path) -> None:
-    told = splatctrl(
-        "score", older / "scene", "--reference", older / "tabletop.capture", "--allow-training", "--json",
-        "-o", tmp_path / "score",
-    )  # fmt: skip
-    assert told.returncode == 0, told.stderr
-    assert json.loads(told.stdout)["metrics"]["psnr_seen"] == pytest.approx(15.333, abs=0.01)
+    words = ["score", older / "scene", "--reference", older / "tabletop.capture", "--allow-training"]
+    answer = answer_of(*words, "-o", tmp_path / "score")
+    assert answer["metrics"]["psnr_seen"] == pytest.approx(15.333, abs=0.01)

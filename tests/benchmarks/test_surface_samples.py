@@ -43,5 +43,4 @@ def test_inscribed_balls_touch_their_sample_and_stay_inside() -> None:
 
 def test_where_there_is_room_the_ball_is_as_large_as_asked() -> None:
     samples = SurfaceSamples(points=np.zeros((1, 3)), normals=np.array([[0.0, 0, 1]]))
-    half_space = inscribed_radii(samples, 0.01, lambda points: points * [1, 1, 0])
-    assert half_space.tolist() == [0.01]
+    assert inscribed_radii(samples, 0.01, lambda points: points * [1, 1, 0]).tolist() == [0.01]

@@ -84,8 +84,7 @@ def test_a_step_moves_what_is_free_and_holds_the_rest() -> None:
     moved = unknowns.moved(start, step)
     np.testing.assert_allclose(twist_between(start.corrections["b"], moved.corrections["b"]), step[:6], atol=1e-12)
     np.testing.assert_array_equal(moved.corrections["a"], np.eye(4))
-    assert moved.depth_of("b") == pytest.approx((1.05, 0.0))
-    assert moved.clock == pytest.approx(0.004)
+    assert (moved.depth_of("b"), moved.clock) == (pytest.approx((1.05, 0.0)), pytest.approx(0.004))
 
 
 def test_a_twist_gives_back_its_transform() -> None:

@@ -63,9 +63,8 @@ def table(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Table:
 
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_PAIRS", 24)
-    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_POINTS", 700)
-    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_LANDED", 300)
+    for name, value in {"VIEWS_PAIRS": 24, "VIEWS_POINTS": 700, "VIEWS_LANDED": 300}.items():
+        monkeypatch.setattr(f"splatctrl_cli.checks.limits.{name}", value)
 
 
 def moved(frames: Sequence[RgbdFrame], camera: str, position: tuple[float, ...], degrees: float) -> list[RgbdFrame]:
@@ -147,11 +146,15 @@ def test_a_camera_whose_brightness_changes_is_named_with_its_ratio(
 
 
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
-    walls = []
-    for index in range(4):
-        T = pose_at([0.3 * index, 0.0, 0.0])
-        frame = table.frames[index]
-        walls.append(replace(frame, depth=np.full_like(frame.depth, 1.2), T_world_camera=T, camera=f"cam{index % 2}"))
+    walls = [
+        replace(
+            frame,
+            depth=np.full_like(frame.depth, 1.2),
+            T_world_camera=pose_at([0.3 * index, 0.0, 0.0]),
+            camera=f"cam{index % 2}",
+        )
+        for index, frame in enumerate(table.frames[:4])
+    ]
     assert table.views(walls)[0] == []
 
 
@@ -196,14 +199,12 @@ def test_a_shift_within_the_smear_of_edges_is_none_in_small_images(table: Table)
 
 
 def test_joints_or_a_camera_of_another_clock_are_named_with_the_offset(table: Table) -> None:
-    states = replace(table.states, stamp_ns=table.states.stamp_ns + 80_000_000)
-    (finding,) = table.motion(table.few, states)
-    assert (finding.code, finding.where, finding.severity) == ("robot-clock", "joint states", Severity.WARNING)
-    assert finding.value == pytest.approx(-80, abs=10)
+    (finding,) = table.motion(table.few, replace(table.states, stamp_ns=table.states.stamp_ns + 80_000_000))
+    assert (finding.code, finding.where, finding.value) == ("robot-clock", "joint states", pytest.approx(-80, abs=10))
+    assert finding.severity is Severity.WARNING
     frames = [replace(f, stamp_ns=f.stamp_ns + 100_000_000) if f.camera == "cam1" else f for f in table.few]
     (finding,) = table.motion(frames, table.states)
-    assert (finding.code, finding.where) == ("robot-clock", "camera cam1")
-    assert finding.value == pytest.approx(100, abs=10)
+    assert (finding.code, finding.where, finding.value) == ("robot-clock", "camera cam1", pytest.approx(100, abs=10))
 
 
 def test_exchanged_joints_are_named(table: Table) -> None:
@@ -216,6 +217,5 @@ def test_a_joint_whose_zero_is_off_is_found(table: Table) -> None:
     position = np.asarray(table.states.position[0 : len(table.states)]).copy()
     position[:, 1] += np.radians(5)
     (finding,) = table.motion(table.few, replace(table.states, position=position))
-    assert finding.code == "arm"
-    assert finding.value == pytest.approx(30, abs=8)
+    assert (finding.code, finding.value) == ("arm", pytest.approx(30, abs=8))
     assert "the joints' zeros" in finding.remedy

@@ -56,8 +56,7 @@ def test_poses_of_a_link_agree_with_it_and_those_of_the_world_are_not_moved_by_t
     assert pose_agreement(model, states_with(q, lambda _: None)) is None
     found = pose_agreement(model, states_with(q, lambda q: in_base(model, q, link)))
     assert (found.verdict, found.link, found.num_poses) == ("agree", link, 60)
-    assert found.difference.max_position < 1e-9
-    assert found.difference.max_rotation < 1e-6
+    assert found.difference.max_position < 1e-9 and found.difference.max_rotation < 1e-6
     states = [replace(s, T_world_ee=model.frame_pose(s.position, link)) for s in states_with(q, lambda _: None)]
     assert pose_agreement(model, states).verdict == "agree"
 
@@ -65,19 +64,16 @@ def test_poses_of_a_link_agree_with_it_and_those_of_the_world_are_not_moved_by_t
 def test_a_constant_transform_in_the_hand_is_a_tool(model: RobotModel) -> None:
     link = model.frame_names[-1]
     found = pose_agreement(model, states_with(motion(model), lambda q: in_base(model, q, link) @ TOOL))
-    assert found.verdict == "tool"
     in_link = np.linalg.inv(model.frame_pose(model.middle, found.link)) @ model.frame_pose(model.middle, link) @ TOOL
-    assert found.offset == pytest.approx(in_link, abs=1e-6)
-    assert found.rest.max_position < 1e-6
-    assert "a flange or tool transform" in found.sentence
+    assert (found.verdict, found.offset) == ("tool", pytest.approx(in_link, abs=1e-6))
+    assert found.rest.max_position < 1e-6 and "a flange or tool transform" in found.sentence
 
 
 def test_a_constant_transform_in_the_world_is_a_wrong_base(model: RobotModel) -> None:
     link = model.frame_names[-1]
     found = pose_agreement(model, states_with(motion(model), lambda q: TOOL @ in_base(model, q, link)))
-    assert found.verdict == "base"
     in_world = model.T_world_base @ TOOL @ np.linalg.inv(model.T_world_base)
-    assert found.offset == pytest.approx(in_world, abs=1e-6)
+    assert (found.verdict, found.offset) == ("base", pytest.approx(in_world, abs=1e-6))
     assert "is --base right?" in found.sentence
 
 
@@ -92,8 +88,7 @@ def test_what_no_constant_transform_explains_is_another_robot(
 ) -> None:
     link = model.frame_names[-1]
     found = pose_agreement(model, states_with(motion(model), lambda q: in_base(model, wrong(q), link)))
-    assert found.verdict == "disagree"
-    assert found.rest.max_position > 0.02
+    assert found.verdict == "disagree" and found.rest.max_position > 0.02
     assert "wrong URDF, joint order, or units?" in found.sentence
     still = pose_agreement(
         model, states_with(motion(model, amplitude=1e-4), lambda q: in_base(model, q, link) @ TOOL)
@@ -103,20 +98,18 @@ def test_what_no_constant_transform_explains_is_another_robot(
 
 def test_degrees_are_refused_and_radians_are_not(model: RobotModel) -> None:
     q = motion(model)
-    zero = np.zeros(model.num_joints)
-
-    def states(positions: Float64) -> list[JointState]:
-        return [JointState(stamp_ns=i, position=row, velocity=zero) for i, row in enumerate(positions)]
-
-    check_angles(model, states(q), "log")
-    check_angles(model, states(q + 1.0), "log")  # beyond limits is for the audit to say
-    check_angles(model, states(q[:, ::-1]), "log")  # another joint order
-    check_angles(model, states(np.degrees(q) * 100), "log")  # degrees of no posture of this robot either
     one = np.degrees(q) * 100
     one[:, 0] = np.degrees(q[:, 0])
-    check_angles(model, states(one), "log")  # a joint that fits does not make degrees of the others
+    for radians in (
+        q,
+        q + 1.0,  # beyond limits is for the audit to say
+        q[:, ::-1],  # another joint order
+        np.degrees(q) * 100,  # degrees of no posture of this robot either
+        one,  # a joint that fits does not make degrees of the others
+    ):
+        check_angles(model, states_with(radians, lambda _: None), "log")
     words = 'log: joint .* which would fit as degrees.*; .*unit = "deg"'
-    expect_refusal(words, check_angles, model, states(np.degrees(q)), "log")
+    expect_refusal(words, check_angles, model, states_with(np.degrees(q), lambda _: None), "log")
 
 
 def test_states_beyond_the_limits_are_a_warning_with_the_joint(model: RobotModel) -> None:
@@ -124,8 +117,8 @@ def test_states_beyond_the_limits_are_a_warning_with_the_joint(model: RobotModel
     assert robot_findings(model, states_with(q, lambda _: None)) == []
     q[7, 3] = model.upper[3] + 0.2
     (finding,) = robot_findings(model, states_with(q, lambda _: None))
-    assert (finding.code, finding.severity, finding.stamp_ns) == ("joints-limits", Severity.WARNING, 7)
-    assert finding.value == pytest.approx(0.2)
+    found = finding.code, finding.severity, finding.stamp_ns, finding.value
+    assert found == ("joints-limits", Severity.WARNING, 7, pytest.approx(0.2))
     assert f"1 of 60 states are beyond the URDF's limits, {model.joint_names[3]}" in finding.what
 
 
@@ -135,9 +128,12 @@ def test_end_effector_poses_of_another_robot_are_an_error(model: RobotModel) -> 
     assert (good.code, good.severity, good.value) == ("end-effector", Severity.NOTE, pytest.approx(0, abs=0.01))
     poses = iter([in_base(model, row, "hand") for row in q[::-1]])
     (other,) = robot_findings(model, states_with(q, lambda _: next(poses)))
-    assert (other.code, other.severity) == ("end-effector", Severity.ERROR)
-    assert other.value > 100
-    assert other.remedy == "give the URDF of this very robot, and its --base"
+    remedy = "give the URDF of this very robot, and its --base"
+    assert (other.code, other.severity, other.remedy) == (
+        "end-effector",
+        Severity.ERROR,
+        remedy,
+    ) and other.value > 100
 
 
 INTERVAL = 0.2  # [s] between the frames of the sample
@@ -170,8 +166,7 @@ def test_silhouettes_find_the_offset_to_a_fraction_of_the_time_between_frames(
 ) -> None:
     states, motion, points = sample
     found = estimate_clock_offset(shifted(states, seconds), motion, points)
-    assert abs(found.offset_s - seconds) < 0.15 * INTERVAL
-    assert abs(found.offset_s - seconds) < 2 * found.uncertainty_s
+    assert abs(found.offset_s - seconds) < min(0.15 * INTERVAL, 2 * found.uncertainty_s)
     assert "frames are stamped" in found.sentence
 
 
@@ -267,7 +262,6 @@ def test_a_silhouette_is_the_sphere_that_is_nearest() -> None:
     )
     centers = np.array([[[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]]])
     depth = silhouettes(centers, np.array([0.25, 1.0, 0.1, 0.5]), camera)[0]
-    assert depth[10, 10] == pytest.approx(1.75)
-    assert depth[10, 15] == pytest.approx(1.9)
+    assert (depth[10, 10], depth[10, 15]) == (pytest.approx(1.75), pytest.approx(1.9))
     assert depth[10, 6] == pytest.approx(3 - np.sqrt(1 - 0.6**2))
     assert depth[0, 0] == 0

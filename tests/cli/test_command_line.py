@@ -94,6 +94,10 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: st
         assert word in done.stderr
 
 
+def run_process(words: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+
+
 def test_help_imports_nothing_heavy_and_fits_a_screen() -> None:
     """Of a command: its usage, the options that people use, two examples, and where to find the rest."""
     program = f"""
@@ -132,21 +136,21 @@ def test_what_people_look_for_is_in_the_short_help(
     assert re.search(rf"(^|\s){word}\b", capsys.readouterr().out)
 
 
-def test_help_prints_a_page_and_names_the_nearest_for_a_wrong_word(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["help", "ci"]) == 0
-    assert capsys.readouterr().out == (ROOT / "docs" / "ci.md").read_text()
-    assert main(["help", "scannet"]) == 0
-    assert capsys.readouterr().out == (ROOT / "docs" / "examples" / "scannet.toml").read_text()
-    assert main(["help"]) == 0
-    assert capsys.readouterr().out == (ROOT / "docs" / "README.md").read_text()
-    assert main(["help", "settings"]) == 0
-    assert main(["config", "--template"]) == 0
-    help_page, template = capsys.readouterr().out.split("[scene]\n")[1:]
-    assert help_page.strip() == template.strip()
-    assert main(["help", "info"]) == 0
-    assert "--intrinsics" in capsys.readouterr().out
-    assert main(["help", "replays"]) == 2
-    assert capsys.readouterr().err == "splatctrl: help: no page 'replays'; did you mean replay?\n"
+@pytest.mark.parametrize(
+    ("words", "page"),
+    [("ci", "docs/ci.md"), ("scannet", "docs/examples/scannet.toml"), ("", "docs/README.md")],
+)
+def test_help_prints_a_page(words: str, page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["help", *words.split()]) == 0
+    assert capsys.readouterr().out == (ROOT / page).read_text()
+
+
+def test_help_prints_the_settings_and_names_the_nearest_page_for_a_wrong_word() -> None:
+    done = [splatctrl(*words.split()) for words in ("help settings", "config --template", "help info")]
+    shown, template, info = (each.stdout for each in done)
+    assert {each.returncode for each in done} == {0} and "--intrinsics" in info
+    assert shown.split("[scene]\n", 1)[1].strip() == template.split("[scene]\n", 1)[1].strip()
+    assert_refused(splatctrl("help", "replays"), 2, "splatctrl: help: no page 'replays'; did you mean replay?\n")
 
 
 def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:
@@ -312,7 +316,7 @@ def test_a_stream_that_is_closed_is_told_where_there_was_something_to_print(
     closed: str, words: list[str], code: int, said: str
 ) -> None:
     shell = ["sh", "-c", f'"$@" {closed}', "sh", sys.executable, "-m", "splatctrl_cli", *words]
-    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    done = run_process(shell)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.startswith(said) and done.stderr.count("\n") == bool(said)
 
@@ -326,7 +330,7 @@ def test_a_reader_that_stops_after_the_first_line_ends_the_program_quietly(
 ) -> None:
     program = [str(Path(sys.executable).with_name("splatctrl")), *(word.format(log=work.log) for word in words)]
     shell = ["bash", "-c", f'"$@" | {reader}; echo "code ${{PIPESTATUS[0]}}"', "bash", *program]
-    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    done = run_process(shell)
     *lines, code = done.stdout.splitlines()
     assert (code, done.stderr, [Path(line.split(":")[0]).name for line in lines]) == ("code 0", "", first)
 
@@ -334,7 +338,7 @@ def test_a_reader_that_stops_after_the_first_line_ends_the_program_quietly(
 def test_an_output_is_written_though_stdout_is_closed(work: Work, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "splatctrl_cli", "ingest", str(work.log), "-o", str(tmp_path / "x.capture")]
     shell = ["sh", "-c", '"$@" >&-', "sh", *command]
-    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    done = run_process(shell)
     assert done.returncode == 6 and "stdout: closed" in done.stderr
     assert (tmp_path / "x.capture/run.json").is_file()
 

@@ -1,13 +1,11 @@
 """The completion scripts: each shell takes its own, and it completes; and words that are gone."""
 
-import argparse
 import ast
 import dataclasses
 import importlib
 import inspect
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,13 +18,15 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import GONE, Parser
 from splatctrl_cli.config import Config
 from tests.cli import here
+from tests.cli.test_command_line import leaves
+from tests.robot.shapes import written
+from tests.test_docs import leaves as parsers_of
 
 
 @pytest.fixture(scope="module")
 def bash(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    script = tmp_path_factory.mktemp("completion") / "splatctrl.bash"
-    script.write_text(here.splatctrl("completion", "bash").stdout)
-    return script
+    script = here.splatctrl("completion", "bash").stdout
+    return written(tmp_path_factory.mktemp("completion"), script, "splatctrl.bash")
 
 
 def completed(script: Path, *words: str) -> list[str]:
@@ -43,15 +43,24 @@ printf '%s\\n' "${COMPREPLY[@]}"
     return done.stdout.split()
 
 
-def test_bash_completes_commands_options_choices_and_files(bash: Path) -> None:
-    assert set(completed(bash, "splatctrl", "")) == set(COMMANDS)
-    assert completed(bash, "splatctrl", "sdf-bake", "--dist") == ["--distance"]
-    assert completed(bash, "splatctrl", "sdf-bake", "--distance", "sa") == ["safe", "safe_gpdf"]
-    assert completed(bash, "splatctrl", "robot", "sph") == ["spheres"]
-    assert completed(bash, "splatctrl", "robot", "spheres", "--max-d") == ["--max-deficit"]
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("sdf-bake --dist", ["--distance"]),
+        ("sdf-bake --distance sa", ["safe", "safe_gpdf"]),
+        ("robot sph", ["spheres"]),
+        ("robot spheres --max-d", ["--max-deficit"]),
+    ],
+)
+def test_bash_completes_options_and_choices(bash: Path, words: str, offered: list[str]) -> None:
+    assert completed(bash, "splatctrl", *words.split()) == offered
+
+
+def test_bash_completes_commands_and_files(bash: Path) -> None:
     (bash.parent / "scene.toml").touch()
-    assert "scene.toml" in completed(bash, "splatctrl", "reconstruct", "sce")
-    assert "scene.toml" in completed(bash, "splatctrl", "reconstruct", "--config", "sce")
+    assert set(completed(bash, "splatctrl", "")) == set(COMMANDS)
+    for option in ([], ["--config"]):
+        assert "scene.toml" in completed(bash, "splatctrl", "reconstruct", *option, "sce")
 
 
 @pytest.mark.parametrize("shell", [shell for shell in SHELLS if shell != "bash"])
@@ -59,8 +68,7 @@ def test_the_other_shells_accept_theirs_where_they_are_installed(shell: str, tmp
     script = here.splatctrl("completion", shell).stdout
     assert "max-splats" in script  # tcsh adds the dashes
     if shutil.which(shell) is not None:
-        (tmp_path / "script").write_text(script)
-        assert subprocess.run([shell, "-n", tmp_path / "script"], check=False).returncode == 0
+        assert subprocess.run([shell, "-n", written(tmp_path, script, "script")], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("words", GONE)
@@ -72,22 +80,9 @@ def test_what_left_names_its_successor(words: str, capsys: pytest.CaptureFixture
 TABLES = ("DECIDING_OPTIONS",)  # of the names that a command reads by getattr
 
 
-def leaves() -> Iterator[tuple[str, ...]]:
-    for name, command in COMMANDS.items():
-        yield from ((name, action) for action in command.actions) if command.actions else ((name,),)
-
-
-def command_of(words: tuple[str, ...]) -> Command:
-    command = COMMANDS[words[0]]
-    return command.actions[words[1]] if command.actions else command
-
-
-def declared(words: tuple[str, ...]) -> dict[str, set[str]]:
+def declared(words: list[str]) -> dict[str, set[str]]:
     """Names by option, of which a command reads at least one: its own and those of its fields."""
-    parser: argparse.ArgumentParser = build_parser(words[0])
-    for word in words:
-        below = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-        parser = below.choices[word]
+    (parser,) = (each for each in parsers_of(build_parser(words[0])) if each.prog.split()[1:] == words)
     assert isinstance(parser, Parser)
     actions: Any = parser._actions
     return {a.dest: {a.dest, *a.fields, *(["config"] if a.sets else [])} for a in actions if "help" not in a.dest}
@@ -127,9 +122,9 @@ def read_by(module: ModuleType, function: str, seen: set[str]) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("words", [*leaves()], ids=" ".join)
-def test_every_declared_option_is_read(words: tuple[str, ...]) -> None:
-    module, _, function = command_of(words).run.partition(":")
+@pytest.mark.parametrize(("words", "command"), [*leaves(COMMANDS)], ids=lambda value: str(value)[:20])
+def test_every_declared_option_is_read(words: list[str], command: Command) -> None:
+    module, _, function = command.run.partition(":")
     room = importlib.import_module(f"splatctrl_cli.cli.{module}")
     read = read_by(room, function, set()) | read_by(main_module, "_run", set())
     assert not [option for option, names in declared(words).items() if not names & read]

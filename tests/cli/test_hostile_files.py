@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.formats.arrays import npy_of
@@ -27,6 +28,7 @@ from tests.formats.splat.test_gaussian_ply import gaussian_set
 from tests.recording.folder.make_layout import make_tum
 from tests.recording.log.make_log import LogRecipe, make_log
 from tests.refused import expect_refusal
+from tests.robot.shapes import written
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
@@ -57,8 +59,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def xml(folder: Path, text: str) -> list[str]:
-    (folder / "x.urdf").write_text(text)
-    return ["robot", "info", "--urdf", str(folder / "x.urdf")]
+    return ["robot", "info", "--urdf", str(written(folder, text, "x.urdf"))]
 
 
 def images(folder: Path, name: str, depth: bytes) -> list[str]:
@@ -69,8 +70,8 @@ def images(folder: Path, name: str, depth: bytes) -> list[str]:
     (folder / "t.log").write_text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     frames = f'[frames]\ncolor = "rgb/*.png"\ndepth = "depth/*.{name}"\n[depth]\nscale = 1e-3\n'
     poses = '[poses]\nformat = "trajectory-log"\nfile = "t.log"\n'
-    (folder / "x.toml").write_text(f'root = "."\n{CAMERA}{frames}{poses}')
-    return ["ingest", str(folder / "x.toml"), "-o", str(folder / "x.capture")]
+    described = written(folder, f'root = "."\n{CAMERA}{frames}{poses}', "x.toml")
+    return ["ingest", str(described), "-o", str(folder / "x.capture")]
 
 
 def saved(path: Path, data: bytes) -> list[str]:
@@ -90,8 +91,7 @@ def states(folder: Path, shape: tuple[int, ...]) -> list[str]:
     """A table of joint states of really packed zeros."""
     write_zeros(folder / "x.npz", {"t": ((shape[0],), "<f8"), "q": (shape, "<f8")})
     table = '[states]\nfile = "x.npz"\njoints = ["a", "b"]\ntime = "t"\nposition = "q"\n'
-    (folder / "x.toml").write_text(table)
-    return ["check", str(folder / "x.toml")]
+    return ["check", str(written(folder, table, "x.toml"))]
 
 
 BLOATED = (  # a header of no pixels, then a chunk that announces 0x77000000 bytes
@@ -181,21 +181,29 @@ def test_a_package_path_that_leaves_its_package_is_refused(tmp_path: Path) -> No
         expect_refusal("lies outside its package", mesh_path, package / "x.urdf", replace(mesh, filename=name))
 
 
-def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:
-    for array in (
+@pytest.mark.parametrize(
+    "array",
+    [
         np.arange(6, dtype="<f4").reshape(2, 3),
         np.asfortranarray(np.arange(6).reshape(2, 3)),
         np.zeros(0),
-    ):
-        stream = io.BytesIO()
-        np.save(stream, array)
-        assert np.array_equal(npy_of(stream.getvalue()), array)
-        with pytest.raises(ValueError, match="announces"):
-            npy_of(stream.getvalue() + b"x")
-    with pytest.raises(ValueError, match="announces 4398046511104 bytes, holds 64"):
-        npy_of(npy(HUGE))
-    with pytest.raises(ValueError, match="objects"):
-        npy_of(npy((1,), "|O"))
+    ],
+)
+def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further(array: NDArray[np.generic]) -> None:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    assert np.array_equal(npy_of(stream.getvalue()), array)
+    with pytest.raises(ValueError, match="announces"):
+        npy_of(stream.getvalue() + b"x")
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [(npy(HUGE), "announces 4398046511104 bytes, holds 64"), (npy((1,), "|O"), "objects")],
+)
+def test_a_npy_file_of_more_than_it_holds_or_of_objects_is_not_read(data: bytes, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        npy_of(data)
 
 
 RUN_LINES = """

@@ -28,8 +28,13 @@ from tests.recording.log.make_log import (
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     code = main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
+    return code, *capsys.readouterr()
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict[str, Any], str]:
+    """What a command returns, its object, and what it says on stderr."""
+    code, printed, said = run(capsys, *arguments, "--json")
+    return code, json.loads(printed), said
 
 
 def test_ingest_writes_a_capture_that_reads_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,8 +43,7 @@ def test_ingest_writes_a_capture_that_reads_back(tmp_path: Path, capsys: pytest.
         make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"), tf_frames=3)),
         tmp_path / "x.capture",
     )
-    code, printed, _ = run(capsys, "ingest", log, "--cameras", " cam1, cam0,", "-o", out, "--json")
-    result = json.loads(printed)
+    code, result, _ = run_json(capsys, "ingest", log, "--cameras", " cam1, cam0,", "-o", out)
     assert (code, result["frames"], result["joint_states"]) == (0, {"cam0": 3, "cam1": 3}, 5)
     assert len(list(open_source(out).records())) == 11
     assert json.loads((out / "run.json").read_text())["inputs"].keys() == {"log.mcap"}
@@ -50,8 +54,8 @@ def test_ingest_writes_a_capture_that_reads_back(tmp_path: Path, capsys: pytest.
 def test_a_truncated_log_is_exit_3_with_what_precedes_the_cut(
     logs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, printed, _ = run(capsys, "ingest", logs["cut"], "-o", tmp_path / "x.capture", "--json")
-    assert (code, json.loads(printed)["loss"]["damaged"]) == (3, 1)
+    code, result, _ = run_json(capsys, "ingest", logs["cut"], "-o", tmp_path / "x.capture")
+    assert (code, result["loss"]["damaged"]) == (3, 1)
     assert (tmp_path / "x.capture" / "capture.json").is_file()
     assert run(capsys, "info", logs["cut"])[0] == 3
 
@@ -78,8 +82,7 @@ def test_info_says_for_people_and_in_json_what_is_there_and_what_is_missing(
     code, printed, _ = run(capsys, "info", log)
     assert code == 0
     assert "missing for a reconstruction: no depth topic" in printed and "/joint_states" in printed
-    code, printed, _ = run(capsys, "info", log, "--json")
-    result = json.loads(printed)
+    code, result, _ = run_json(capsys, "info", log)
     assert result["kind"] == "MCAP" and result["missing"][0].startswith("no depth topic")
     assert {row["topic"] for row in result["topics"]} >= {"/tf", "/joint_states"}
 
@@ -140,15 +143,12 @@ def test_a_finding_fails_where_it_is_asked_to(
 def test_an_error_is_an_object_of_which_stderr_has_the_sentence_where_it_fails(
     logs: dict[str, Path], capsys: pytest.CaptureFixture[str], fail_on: str, code: int
 ) -> None:
-    found, printed, said = run(capsys, "check", logs["depth"], "--fail-on", fail_on, "--json")
-    result = json.loads(printed)
+    found, result, said = run_json(capsys, "check", logs["depth"], "--fail-on", fail_on)
     assert said == (f"splatctrl: {result['verdict']['sentence']}\n" if code else "")
     assert (found, result["exit_code"], result["verdict"]["outcome"]) == (code, code, "failed")
     assert result["verdict"]["reasons"][0]["criterion"] == "depth-scale" and result["counts"]["error"] == 1
-    finding = result["findings"][0]
-    place = ("error", "depth-scale", "/cam0/depth/image_raw")
-    assert (finding["severity"], finding["code"], finding["where"]) == place
-    assert finding["value"] == pytest.approx(0.001)
+    finding = {name: result["findings"][0][name] for name in ("severity", "code", "where", "value")}
+    assert [*finding.values()] == ["error", "depth-scale", "/cam0/depth/image_raw", pytest.approx(0.001)]
     assert all("depth-scale" in result["commands"][name][-1] for name in CHECKS["depth-scale"].blocked)
 
 
@@ -156,11 +156,9 @@ def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(
     real_data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     description = Path(__file__).parents[2] / "docs/examples/arc_bin_2cam.toml"
-    code, printed, _ = run(capsys, "check", description, "--root", real_data / "arc_bin_2cam", "--json")
-    assert code == 1
-    finding = json.loads(printed)["findings"][0]
-    assert (finding["code"], finding["severity"], finding["unit"]) == ("agreement", "error", "mm")
-    assert finding["value"] == pytest.approx(99, abs=3)
+    code, result, _ = run_json(capsys, "check", description, "--root", real_data / "arc_bin_2cam")
+    finding = {name: result["findings"][0][name] for name in ("code", "severity", "unit", "value")}
+    assert (code, *finding.values()) == (1, "agreement", "error", "mm", pytest.approx(99, abs=3))
 
 
 def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,12 +169,10 @@ def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys:
         yield log_time, topic, kind, message
 
     log = broken_log(tmp_path / "log.mcap", farther, replace(GOOD, cameras=("cam0", "cam1")))
-    code, printed, _ = run(capsys, "check", log, "--json")
-    result = json.loads(printed)
-    finding = result["findings"][0]
-    assert (code, finding["code"], finding["where"]) == (1, "agreement", "cameras cam0 and cam1")
-    assert "poses are off, or too little depth is left" in finding["remedy"]
-    assert finding["value"] == pytest.approx(100)
+    code, result, _ = run_json(capsys, "check", log)
+    finding = {name: result["findings"][0][name] for name in ("code", "where", "value")}
+    assert (code, *finding.values()) == (1, "agreement", "cameras cam0 and cam1", pytest.approx(100))
+    assert "poses are off, or too little depth is left" in result["findings"][0]["remedy"]
     assert "agreement" in result["commands"]["reconstruct"][0] and result["commands"]["ingest"] == []
 
 
@@ -202,13 +198,11 @@ def test_a_capture_is_checked_as_its_log(
 ) -> None:
     capture = tmp_path / "x.capture"
     assert run(capsys, "ingest", logs["poses"], "-o", capture, "-q")[0] == 0
-    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning", "--json")
-    result = json.loads(printed)
+    code, result, _ = run_json(capsys, "check", capture, "--fail-on", "warning")
     assert (code, result["kind"]) == (1, "capture")
     assert [f["code"] for f in result["findings"] if f["severity"] != "note"] == ["pose-missing"]
     (capture / "depth/cam0/000003.png").write_bytes(b"")
-    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning")
-    assert "depth/cam0/000003.png: its checksum differs" in printed
+    assert "depth/cam0/000003.png: its checksum differs" in run(capsys, "check", capture)[1]
 
 
 @pytest.mark.parametrize(("num", "is_folded"), [(3, False), (4, True)])

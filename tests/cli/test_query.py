@@ -39,8 +39,8 @@ def test_json_has_the_figures_of_what_is_written(folder: Path) -> None:
     done = splatctrl("query", folder / "splats.ply", folder / "points.csv", "-o", out, "--json")
     found = json.loads(done.stdout)
     assert found["out"] == str(out) and found["source"] == "scene" and found["notes"] == []
-    rows = out.read_text().splitlines()
-    assert found["min_distance"] == pytest.approx(min(float(row.split(",")[4]) for row in rows[1:]), abs=1e-6)
+    least = min(float(row.split(",")[4]) for row in out.read_text().splitlines()[1:])
+    assert found["min_distance"] == pytest.approx(least, abs=1e-6)
 
 
 def test_a_table_with_a_wrong_line_prints_nothing(folder: Path) -> None:

@@ -15,7 +15,7 @@ from splatctrl_cli.formats.splat.splats import read_ply
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.recording.source import open_source
 from splatctrl_cli.recording.source_options import SourceOptions
-from splatctrl_cli.records import Label, RgbdFrame
+from splatctrl_cli.records import Float64, Label, RgbdFrame
 from splatctrl_cli.scene.recording_consistency import CAUSES
 from tests.cli.here import splatctrl
 from tests.recording.log.make_log import LogRecipe, make_log
@@ -43,22 +43,22 @@ def test_a_robot_at_a_base_makes_the_map_of_one_at_the_origin_moved_there(
     small_recording: Path, tmp_path: Path
 ) -> None:
     """The same images by cameras turned and moved with the robot, by half a metre and a right angle."""
-    T = np.eye(4)
-    T[:3] = [[0, -1, 0, 0.5], [1, 0, 0, -0.3], [0, 0, 1, 0.8]]
+    T = np.array([[0, -1, 0, 0.5], [1, 0, 0, -0.3], [0, 0, 1, 0.8], [0, 0, 0, 1]])
+
+    def numbers(pose: Float64) -> str:
+        return ",".join(f"{value:.17g}" for value in [*pose[:3, 3], *quat_from_rotation(pose[:3, :3])])
+
     frames = open_source(small_recording / "log.mcap", SourceOptions(cameras=("cam0", "cam1"))).records()
     poses = {each.camera: T @ each.T_world_camera for each in frames if isinstance(each, RgbdFrame)}
-    numbers = {
-        name: ",".join(f"{value:.17g}" for value in [*pose[:3, 3], *quat_from_rotation(pose[:3, :3])])
-        for name, pose in poses.items()
-    }
-    moved = [word for name in numbers for word in ("--camera-pose", f"{name}={numbers[name]}")]
-    base = ",".join(f"{value:.17g}" for value in [*T[:3, 3], *quat_from_rotation(T[:3, :3])])
+    moved = [word for name, pose in poses.items() for word in ("--camera-pose", f"{name}={numbers(pose)}")]
     assert reconstruct(small_recording, tmp_path / "origin") == 0
-    assert reconstruct(small_recording, tmp_path / "moved", f"--base={base}", *moved) == 0
-    here, there = (open_scene(tmp_path / name).run["metrics"] for name in ("origin", "moved"))
-    assert there["self_mask_residual_mm"] == pytest.approx(here["self_mask_residual_mm"], abs=0.1)
-    assert there["robot_splats"] == pytest.approx(here["robot_splats"], rel=0.25)
-    assert there["psnr"] == pytest.approx(here["psnr"], abs=0.5)
+    assert reconstruct(small_recording, tmp_path / "moved", f"--base={numbers(T)}", *moved) == 0
+    here, there = (metrics(tmp_path / name) for name in ("origin", "moved"))
+    assert {name: there[name] for name in ("self_mask_residual_mm", "robot_splats", "psnr")} == {
+        "self_mask_residual_mm": pytest.approx(here["self_mask_residual_mm"], abs=0.1),
+        "robot_splats": pytest.approx(here["robot_splats"], rel=0.25),
+        "psnr": pytest.approx(here["psnr"], abs=0.5),
+    }
     scene = read_ply(tmp_path / "moved" / "splats.ply")[0].centers
     expected = read_ply(tmp_path / "origin" / "splats.ply")[0].centers @ T[:3, :3].T + T[:3, 3]
     distance = np.linalg.norm(scene[:, None] - expected[None], axis=2).min(axis=1)
@@ -128,6 +128,11 @@ def audit(scene: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (scene / "audit.jsonl").read_text().splitlines()]
 
 
+def metrics(scene: Path) -> dict[str, object]:
+    found: dict[str, object] = open_scene(scene).run["metrics"]
+    return found
+
+
 def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,10 +140,8 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     views[2].depth[:] = 0.0
     assert reconstruct_folder(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
     assert "  note: depth: 1 frame has no depth, and seeded no splats" in capsys.readouterr().out
-    rows = audit(tmp_path / "scene")
-    assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
-    assert [len(row["blind"]) for row in rows] == [0, 0, 1, 0]
-    assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
+    counts = [(row["without_depth"], len(row["blind"])) for row in audit(tmp_path / "scene")]
+    assert (counts, metrics(tmp_path / "scene")["frames_without_depth"]) == ([(0, 0), (0, 0), (1, 1), (0, 0)], 1)
 
 
 def test_frames_that_repeat_their_depth_are_left_out_and_counted(
@@ -149,8 +152,8 @@ def test_frames_that_repeat_their_depth_are_left_out_and_counted(
     assert (
         "  note: depth: camera cam0: left out 3 frames that repeat the depth before them" in capsys.readouterr().out
     )
-    metrics = json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]
-    assert (metrics["time_steps"], metrics["repeated_frames"]) == (1, {"cam0": 3})
+    found = metrics(tmp_path / "scene")
+    assert (found["time_steps"], found["repeated_frames"]) == (1, {"cam0": 3})
 
 
 def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -205,8 +208,7 @@ def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
     capsys.readouterr()
     assert reconstruct_folder(description, tmp_path / "both", "--allow-disagreement") == 0
     assert "warning: views.toml: camera cam0 and cam1: depths disagree by 90 mm" in capsys.readouterr().err
-    metrics = json.loads((tmp_path / "both" / "run.json").read_text())["metrics"]
-    assert metrics["disagreement"] == {"cam0 and cam1": 0.09}
+    assert metrics(tmp_path / "both")["disagreement"] == {"cam0 and cam1": 0.09}
     close = write_folder(tmp_path / "close", two_cameras(0.012), has_clock=has_clock)  # a sensor's error
     assert reconstruct_folder(close, tmp_path / "scene", "-q") == 0
 
@@ -242,8 +244,7 @@ def test_who_the_masks_show_is_human_in_scene_and_field(tmp_path: Path) -> None:
     is_human = scene.splats().labels == Label.HUMAN
     assert 10 < is_human.sum() < 0.6 * len(is_human)
     assert (open_scene(tmp_path / "b").splats().labels == scene.splats().labels).all()
-    row = json.loads((tmp_path / "a/audit.jsonl").read_text().splitlines()[-1])
-    assert row["human"] == is_human.sum()
+    assert audit(tmp_path / "a")[-1]["human"] == is_human.sum()
     assert np.count_nonzero(scene.occupancy().entity & Label.HUMAN) > 10
     splatctrl("sdf-bake", tmp_path / "a", "-o", tmp_path / "field")
     splatctrl("sdf-bake", tmp_path / "a", "--include", "none", "-o", tmp_path / "without")

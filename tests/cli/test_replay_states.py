@@ -28,6 +28,7 @@ from tests.recording.log.make_states import (
     store_with,
     write_mcap,
 )
+from tests.robot.shapes import written
 
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 
@@ -65,24 +66,25 @@ def test_logged_end_effector_poses_are_compared_with_the_robot(
     desk: Desk, scene: str, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
     q, link = moving(), arm.frame_names[-1]
-    poses = [arm.frame_pose(row, link) for row in q]
     rows = [
         ",".join(repr(float(v)) for v in (i * 0.01, *row, *T[:3, 3], *quat_from_rotation(T[:3, :3])))
-        for i, (row, T) in enumerate(zip(q, poses, strict=True))
+        for i, (row, T) in enumerate((row, arm.frame_pose(row, link)) for row in q)
     ]
     names = [f"q{i}" for i in range(7)]
     pose = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     (desk.folder / "run.csv").write_text("\n".join([",".join(["t", *names, *pose]), *rows]))
-    described = desk.folder / "run.toml"
-    table = {"file": "run.csv", "joints": list(JOINTS), "time": "t", "position": names, "pose": pose}
-    described.write_text("[states]\n" + "\n".join(f"{key} = {value!r}" for key, value in table.items()))
-    assert replayed(desk, scene, described) == 0
+
+    def described(joints: Sequence[str]) -> Path:
+        table = {"file": "run.csv", "joints": list(joints), "time": "t", "position": names, "pose": pose}
+        return written(
+            desk.folder, "\n".join(["[states]", *(f"{key} = {table[key]!r}" for key in table)]), "run.toml"
+        )
+
+    assert replayed(desk, scene, described(JOINTS)) == 0
     assert f"log: 30 logged end-effector poses agree with {link}: median 0.00 mm" in capsys.readouterr().out
     found = desk.json("states.json")["end_effector_poses"]
     assert found["verdict"] == "agree" and found["difference"]["max_position"] < 1e-9
-    table["joints"] = list(JOINTS[::-1])
-    described.write_text("[states]\n" + "\n".join(f"{key} = {value!r}" for key, value in table.items()))
-    assert replayed(desk, scene, described, "--force") == 0
+    assert replayed(desk, scene, described(JOINTS[::-1]), "--force") == 0
     assert "wrong URDF, joint order, or units?" in capsys.readouterr().out
 
 
@@ -121,9 +123,8 @@ def test_a_table_whose_clock_jumps_is_refused_in_one_line(
     times = 0.001 * np.arange(10)
     times[6:] += 1.7e9
     np.savez(desk.folder / "x.npz", t=times, q=np.repeat(START[None], 10, axis=0))
-    log = desk.folder / "x.toml"
-    log.write_text(f'[states]\nfile = "x.npz"\njoints = {list(JOINTS)}\ntime = "t"\nposition = ["q"]\n')
-    assert replayed(desk, scene, log) == 4
+    text = f'[states]\nfile = "x.npz"\njoints = {list(JOINTS)}\ntime = "t"\nposition = ["q"]\n'
+    assert replayed(desk, scene, written(desk.folder, text, "x.toml")) == 4
     *_, line = capsys.readouterr().err.splitlines()
     assert "joint states: mixed clocks: stamps jump by 1700000000 s at state 6 of 10; cut the log there" in line
 
@@ -133,6 +134,13 @@ STORE = store_with(control_msgs__JointTrajectoryControllerState=NEW_CONTROLLER)
 STATE, CONTROLLER = "sensor_msgs/msg/JointState", "control_msgs/msg/JointTrajectoryControllerState"
 
 
+def postures() -> list[tuple[int, Float64]]:
+    """Stamps and postures of a motion."""
+    return [
+        (START_NS + i * 10_000_000, START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))) for i in range(NUM_STATES)
+    ]
+
+
 def arm_messages() -> list[Message]:
     """An arm whose joints 1 to 4 are in one topic, 5 to 7 in another at other times, and all commands in a third."""
 
@@ -140,37 +148,32 @@ def arm_messages() -> list[Message]:
         return Message(log_ns=stamp, topic=topic, type_name=STATE, content=joint_state(stamp, names, q))
 
     messages = []
-    for i in range(NUM_STATES):
-        stamp = START_NS + i * 10_000_000
-        q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
+    for i, (stamp, q) in enumerate(postures()):
         messages += [said(stamp, "/left", JOINTS[:4], q[:4]), said(stamp + 4_000_000, "/right", JOINTS[4:], q[4:])]
-        if i % 7 == 0:
-            messages.append(said(stamp, "/left", ["finger"], [0.0]))
+        messages += [said(stamp, "/left", ["finger"], [0.0])] if i % 7 == 0 else []
     return messages
 
 
 def controller_messages() -> list[Message]:
     """A controller that reports all joints, with what it was asked for."""
     point, kind = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"], STORE.types[CONTROLLER]
-    nothing = np.zeros(0)
     since = STORE.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+    nothing = np.zeros(0)
 
     def at(position: Any, velocity: Any = nothing) -> Any:
         rest = {"accelerations": nothing, "effort": nothing, "time_from_start": since}
         return point(positions=position, velocities=velocity, **rest)
 
     messages = []
-    for i in range(NUM_STATES):
-        stamp = START_NS + i * 10_000_000 + 1_000_000
-        q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
+    for stamp, q in postures():
         content = kind(
-            header=header(STORE, stamp),
+            header=header(STORE, stamp + 1_000_000),
             joint_names=list(JOINTS),
             feedback=at(q, 0.01 * q),
             reference=at(q, 0.02 * q),
             **{name: at(nothing) for name in ("error", "output", "desired", "actual")},
         )
-        messages.append(Message(log_ns=stamp, topic="/controller", type_name=CONTROLLER, content=content))
+        messages.append(Message(log_ns=stamp + 1_000_000, topic="/controller", type_name=CONTROLLER, content=content))
     return messages
 
 
@@ -179,6 +182,13 @@ def log_with(path: Path, messages: Sequence[Message]) -> Path:
     plain = make_log(path.with_name("plain.mcap"), LogRecipe(has_joints=False, num_frames=6))
     beside = [encoded(item.log_ns, item.topic, item.content, STORE) for item in messages]
     return write_raw(path, [*messages_of(plain), *beside])
+
+
+def ingested(folder: Path, messages: Sequence[Message], *options: str) -> tuple[Path, Path]:
+    """A log with these messages, and its capture."""
+    log, capture = log_with(folder / "log.mcap", messages), folder / "x.capture"
+    assert main(["ingest", str(log), "-o", str(capture), "-q", *options]) == 0
+    return log, capture
 
 
 def audited(source: Path, desk: Desk, out: Path, *options: str) -> tuple[bytes, dict[str, Any], Any]:
@@ -194,8 +204,7 @@ def audited(source: Path, desk: Desk, out: Path, *options: str) -> tuple[bytes, 
 @pytest.mark.parametrize("kind", ["two-topics", "all", "chosen"])
 def test_a_capture_is_replayed_as_its_log(tmp_path: Path, desk: Desk, kind: str) -> None:
     messages = arm_messages() + ([] if kind == "two-topics" else controller_messages())
-    log, capture = log_with(tmp_path / "log.mcap", messages), tmp_path / "x.capture"
-    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    log, capture = ingested(tmp_path, messages)
     options = ["--mode", "open-loop", *(["--joint-topic", "/controller"] if kind == "chosen" else [])]
     steps, metrics, states = audited(log, desk, tmp_path / "of_log", *options)
     assert metrics["num_states"] == (NUM_STATES - 1 if kind == "two-topics" else NUM_STATES)
@@ -204,22 +213,19 @@ def test_a_capture_is_replayed_as_its_log(tmp_path: Path, desk: Desk, kind: str)
 
 
 def test_a_topic_that_was_chosen_while_ingesting_is_that_of_the_replay(tmp_path: Path, arm: RobotModel) -> None:
-    log, capture = log_with(tmp_path / "log.mcap", [*arm_messages(), *controller_messages()]), tmp_path / "x.capture"
-    assert main(["ingest", str(log), "-o", str(capture), "-q", "--joint-topic", "/left"]) == 0
+    _, capture = ingested(tmp_path, [*arm_messages(), *controller_messages()], "--joint-topic", "/left")
     assert open_states(capture, SourceOptions(), arm.joint_names).joint_names == arm.joint_names[:4]
     chosen = SourceOptions(joint_topic="/controller")
     assert open_states(capture, chosen, arm.joint_names).joint_names == arm.joint_names
 
 
 def test_a_capture_keeps_commands_and_they_can_be_read_plainly(tmp_path: Path, arm: RobotModel) -> None:
-    log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
-    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    _, capture = ingested(tmp_path, controller_messages())
     for source in (open_states(capture, SourceOptions(), arm.joint_names), open_source(capture)):
         states = [record for record in source.records() if isinstance(record, JointState)]
         assert len(states) == NUM_STATES
-        for state in states:
-            assert state.commanded_velocity is not None
-            np.testing.assert_allclose(state.commanded_velocity, 0.02 * state.position)
+        commanded, positions = zip(*((state.commanded_velocity, state.position) for state in states), strict=True)
+        np.testing.assert_allclose(commanded, 0.02 * np.array(positions))
     assert np.load(capture / "joint_topics" / "0" / "commanded_velocity.npy").shape == (NUM_STATES, 7)
     assert "commanded_velocity" in np.load(capture / "joints.npz").files
     assert "  joint_topics/0/commanded_velocity.npy\n" in (capture / "SHA256SUMS").read_text()
@@ -228,8 +234,7 @@ def test_a_capture_keeps_commands_and_they_can_be_read_plainly(tmp_path: Path, a
 def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
     tmp_path: Path, desk: Desk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
-    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    _, capture = ingested(tmp_path, controller_messages())
     file = capture / "joint_topics" / "0" / "position.npy"
     file.write_bytes(file.read_bytes()[:-8] + b"\0" * 8)
     scene = [*desk.robot, "--scene", str(tmp_path / "scene")]

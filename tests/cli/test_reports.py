@@ -40,6 +40,14 @@ def suite_in(path: Path) -> TestSuite:
     return suite
 
 
+@pytest.fixture
+def summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """On GitHub: the file of a job's summary."""
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
+    return tmp_path / "summary.md"
+
+
 def test_every_command_that_concludes_takes_junit() -> None:
     """A function concludes if it shows a verdict, directly or through another function of its file."""
     concluding = set()
@@ -143,23 +151,21 @@ def test_a_report_inside_the_output_is_refused(log: Path, tmp_path: Path) -> Non
 
 
 def test_on_github_a_command_annotates_and_sums_up_and_its_json_is_whole(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    log: Path, summary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("GITHUB_ACTIONS", "true")
-    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
     monkeypatch.setenv("GITHUB_WORKSPACE", str(log.parent))
     told = splatctrl("check", log, "--fail-on", "warning", "--json")
     assert json.loads(told.stdout)["exit_code"] == told.returncode == 1
     assert "\n::error file=log.mcap,title=" in told.stderr
-    assert "criteria passed, " in (tmp_path / "summary.md").read_text()
+    assert "criteria passed, " in summary.read_text()
     told = splatctrl("check", log, "--quik")
     assert told.stderr.splitlines()[1].startswith("::error title=check%3A wrong usage (error)::check: unrecognized")
-    assert "did you mean --quick?" in (tmp_path / "summary.md").read_text()
+    assert "did you mean --quick?" in summary.read_text()
     assert splatctrl("info", log, "--quik").stderr.count("\n") == 1, "it judges nothing"
 
 
 def test_a_demo_tells_of_itself_and_not_of_its_steps(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    log: Path, tmp_path: Path, summary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = Reason(criterion="replay", outcome=Outcome.PASSED, sentence="expected 'failed', got 'failed'")
 
@@ -168,19 +174,13 @@ def test_a_demo_tells_of_itself_and_not_of_its_steps(
         return verdict_of("demo", [whole])
 
     monkeypatch.setattr(demo, "demo", one_step)
-    monkeypatch.setenv("GITHUB_ACTIONS", "true")
-    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
     told = splatctrl("demo", "-o", tmp_path / "out", "--junit", tmp_path / "j.xml")
-    assert (told.returncode, "::error" in told.stderr) == (0, False)
+    assert (told.returncode, "::error" in told.stderr, summary.read_text().count("###")) == (0, False, 1)
     assert [case.name for case in suite_in(tmp_path / "j.xml")] == ["replay"]
-    assert (tmp_path / "summary.md").read_text().count("###") == 1
 
 
-def test_a_summary_that_cannot_be_written_is_said_and_changes_nothing(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("GITHUB_ACTIONS", "true")
-    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path))
+def test_a_summary_that_cannot_be_written_is_said_and_changes_nothing(log: Path, summary: Path) -> None:
+    summary.mkdir()
     told = splatctrl("check", log)
     assert (told.returncode, "GITHUB_STEP_SUMMARY: cannot be written" in told.stderr) == (0, True)
 
@@ -205,7 +205,7 @@ def test_a_regression_exits_with_1_and_is_a_failure_in_junit(audits: tuple[Path,
     assert "0.92 s, state 46, hand[11] near unrepresented voxel" in lines["min_clearance"]
     assert "better" in lines["min_self_clearance"] and "num_states" not in lines
     assert lines["control.margin"].split() == ["control.margin", "0.02", "0.03"]
-    (suite,) = JUnitXml.fromfile(str(tmp_path / "j.xml"))
+    suite = suite_in(tmp_path / "j.xml")
     assert [case.name for case in suite if isinstance((case.result or [None])[0], Failure)] == ["min_clearance"]
 
 

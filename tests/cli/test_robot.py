@@ -42,9 +42,16 @@ def test_a_fit_writes_spheres_that_a_check_finds_complete(
     assert "# 5 spheres cover all of it (proven); they stick out by" in out.read_text()
 
 
-def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
-    spheres = written(urdf.parent, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
-    code, out, err = run(capsys, "check", "--urdf", urdf, "--spheres", spheres)
+@pytest.fixture
+def one_sphere(tmp_path: Path) -> Path:
+    """Spheres of one link alone."""
+    return written(tmp_path, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
+
+
+def test_the_table_names_links_and_what_sticks_out(
+    capsys: pytest.CaptureFixture[str], urdf: Path, one_sphere: Path
+) -> None:
+    code, out, err = run(capsys, "check", "--urdf", urdf, "--spheres", one_sphere)
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith("robot check: PASSED (1 spheres on 2 links)")
@@ -53,18 +60,23 @@ def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture
     assert "1 spheres: 100.0 % of the surface outside" in out and "no sphere covers base" in out
 
 
-def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
-    spheres = written(urdf.parent, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
-    check = ("check", "--urdf", urdf, "--spheres", spheres, "-q", "--require")
-    code, out, _ = run(capsys, *check, "uncovered_share<=0.2")
-    assert code == 1
-    assert (
-        "robot check: GATE FAILED (1 spheres on 2 links): --require uncovered_share<=0.2: uncovered_share is 1" in out
-    )
-    code, out, _ = run(capsys, *check, "max_deficit<=0.2")
-    assert code == 5 and "max_deficit is unknown, required <= 0.2" in out
-    code, _, err = run(capsys, *check, "deficit<=0.2")
-    assert (code, "did you mean max_deficit?" in err) == (2, True)
+@pytest.mark.parametrize(
+    ("gate", "code", "said"),
+    [
+        (
+            "uncovered_share<=0.2",
+            1,
+            "robot check: GATE FAILED (1 spheres on 2 links): --require uncovered_share<=0.2: uncovered_share is 1",
+        ),
+        ("max_deficit<=0.2", 5, "max_deficit is unknown, required <= 0.2"),
+        ("deficit<=0.2", 2, "did you mean max_deficit?"),
+    ],
+)
+def test_gates_hold_a_set_to_its_figures(
+    capsys: pytest.CaptureFixture[str], urdf: Path, one_sphere: Path, gate: str, code: int, said: str
+) -> None:
+    found, out, err = run(capsys, "check", "--urdf", urdf, "--spheres", one_sphere, "-q", "--require", gate)
+    assert found == code and said in (err if code == 2 else out)
 
 
 def test_an_open_mesh_says_what_guarantee_remains(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -108,25 +120,20 @@ def test_pairs_are_listed_with_the_reason_of_those_left_out(
     assert (listed["num_sphere_pairs"], listed["num_postures"]) == (0, 0)
 
 
+@pytest.mark.parametrize(("prefix", "is_doubted"), [("panda_", True), ("fr3_", False)])
 def test_spheres_of_another_robots_names_are_matched_and_doubted(
-    capsys: pytest.CaptureFixture[str], urdf: Path
+    capsys: pytest.CaptureFixture[str], urdf: Path, prefix: str, is_doubted: bool
 ) -> None:
     text = urdf.read_text().replace('"base"', '"fr3_base"').replace('"tip"', '"fr3_tip"')
     renamed = written(urdf.parent, text, "fr3.urdf")
-    spheres = written(
-        urdf.parent,
-        "collision_spheres: {panda_tip: [{center: [0, 0, 0], radius: 0.07}], "
-        "panda_base: [{center: [0, 0, 0], radius: 0.2}]}",
-        "s.yaml",
+    radii = ", ".join(
+        f"{prefix}{link}: [{{center: [0, 0, 0], radius: {r}}}]" for link, r in (("tip", 0.07), ("base", 0.2))
     )
-    doubt = "matched without the first part of their names; is it the same robot?"
+    spheres = written(urdf.parent, f"collision_spheres: {{{radii}}}", "s.yaml")
     for action in ("check", "pairs", "info"):
         code, out, _ = run(capsys, action, "--urdf", renamed, "--spheres", spheres)
-        assert code == 0 and doubt in out, action
-    own = written(urdf.parent, spheres.read_text().replace("panda_", "fr3_"), "own.yaml")
-    for action in ("check", "pairs", "info"):
-        code, out, _ = run(capsys, action, "--urdf", renamed, "--spheres", own)
-        assert code == 0 and doubt not in out, action
+        doubt = "matched without the first part of their names; is it the same robot?"
+        assert (code, doubt in out) == (0, is_doubted), action
 
 
 def test_a_robot_whose_meshes_are_not_there_is_shown_all_the_same(

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -117,10 +118,8 @@ def test_a_scene_is_baked_as_it_was_known_then(
     grid = read_npz(tmp_path / "field" / "field.npz")
     assert exact_channel(grid)[1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
     assert (grid.channels["observed"] == observed).all()
-    digests = grid.header["digests"]
-    assert isinstance(digests, dict)
     names = {None: "occupancy.npz", 0.0: "000000.ply", 1.9: "000001.npz", 2.0: "000002.npz"}
-    assert list(digests)[-1] == names[at]
+    assert [*grid.header["digests"]][-1] == names[at]
 
 
 @pytest.mark.usefixtures("painted")
@@ -140,15 +139,24 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
     assert inside.stdout.splitlines()[0] == "sdf-bake: PASSED (3 x 3 x 5 cells of 0.1 m, 1 splats)"
 
 
-def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
-    assert tuple(distance.KERNEL_OF) == FieldConfig.declared["distance"].words
-    assert tuple(weights.METHODS) == FieldConfig.declared["weights"].words
-    assert tuple(distance.PROBABILITIES) == FieldConfig.declared["probability"].words
-    assert tuple(qp.SOLVERS) == ControlConfig.declared["solver"].words
-    assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
-    assert tuple(FORMATS) == scene_options.SPLAT_FORMATS and tuple(grid_format.CHANNELS) == scene_options.CHANNELS
-    assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
-    assert tuple(UNMODELLED) == run_options.UNMODELLED
+@pytest.mark.parametrize(
+    ("names", "listed"),
+    [
+        (distance.KERNEL_OF, FieldConfig.declared["distance"].words),
+        (weights.METHODS, FieldConfig.declared["weights"].words),
+        (distance.PROBABILITIES, FieldConfig.declared["probability"].words),
+        (qp.SOLVERS, ControlConfig.declared["solver"].words),
+        (grid_formats.FORMATS, scene_options.GRID_FORMATS),
+        (FORMATS, scene_options.SPLAT_FORMATS),
+        (grid_format.CHANNELS, scene_options.CHANNELS),
+        (baker.DEFAULT_CHANNELS, scene_options.CHANNELS[:4]),
+        (UNMODELLED, run_options.UNMODELLED),
+    ],
+)
+def test_the_names_that_the_options_list_are_those_of_the_rooms(
+    names: Iterable[str], listed: tuple[str, ...]
+) -> None:
+    assert tuple(names) == listed
 
 
 def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) -> None:
@@ -162,13 +170,19 @@ def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) ->
     assert first == second
 
 
-def test_cameras_that_were_held_out_follow_the_log(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
-    assert split_cameras(f"{log}") == (log, ())
-    assert split_cameras(f"{log}:cam0, cam1") == (log, ("cam0", "cam1"))
-    odd = tmp_path / "a:b.mcap"
-    odd.touch()
-    assert split_cameras(f"{odd}") == (odd, ())
+@pytest.mark.parametrize(
+    ("text", "path", "cameras"),
+    [
+        ("log.mcap", "log.mcap", ()),
+        ("log.mcap:cam0, cam1", "log.mcap", ("cam0", "cam1")),
+        ("a:b.mcap", "a:b.mcap", ()),
+    ],
+)
+def test_cameras_that_were_held_out_follow_the_log(
+    tmp_path: Path, text: str, path: str, cameras: tuple[str, ...]
+) -> None:
+    (tmp_path / "a:b.mcap").touch()
+    assert split_cameras(str(tmp_path / text)) == (tmp_path / path, cameras)
 
 
 def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path) -> None:

@@ -29,15 +29,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
-    names = sorted(path.name for path in recorded.iterdir())
-    assert names == ["dtu", "idr", "log.mcap", "robot.urdf", "robot_spheres.yaml", "run.json", "truth.json"]
-    assert sorted(path.name for path in (recorded / "dtu").iterdir()) == ["Cameras", "Depths_raw", "Rectified"]
-    assert sorted(path.name for path in (recorded / "idr" / "scan1").iterdir()) == [
-        "cameras_sphere.npz",
-        "depth",
-        "image",
-        "mask",
-    ]
+    names = {
+        ".": ["dtu", "idr", "log.mcap", "robot.urdf", "robot_spheres.yaml", "run.json", "truth.json"],
+        "dtu": ["Cameras", "Depths_raw", "Rectified"],
+        "idr/scan1": ["cameras_sphere.npz", "depth", "image", "mask"],
+    }
+    assert {place: sorted(path.name for path in (recorded / place).iterdir()) for place in names} == names
     run = json.loads((recorded / "run.json").read_text())
     assert (run["command"], run["config"]["fps"], run["metrics"]["joint_states"]) == ("simulate", 5.0, 31)
 
@@ -53,14 +50,18 @@ def test_the_same_command_writes_the_same_bytes(recorded: Path, tmp_path: Path) 
 def test_any_ros_2_reader_finds_standard_messages(recorded: Path) -> None:
     with AnyReader([recorded / "log.mcap"]) as reader:
         found = {connection.topic: (connection.msgtype, connection.msgcount) for connection in reader.connections}
-    assert found["/joint_states"] == ("sensor_msgs/msg/JointState", 31)
-    assert found["/tf"] == ("tf2_msgs/msg/TFMessage", 31)
-    assert found["/tf_static"] == ("tf2_msgs/msg/TFMessage", 1)
+    expected = {
+        "/joint_states": ("sensor_msgs/msg/JointState", 31),
+        "/tf": ("tf2_msgs/msg/TFMessage", 31),
+        "/tf_static": ("tf2_msgs/msg/TFMessage", 1),
+    }
     for camera in ("cam0", "cam1", "cam2", "cam3"):
-        assert found[f"/{camera}/color/image_raw/compressed"] == ("sensor_msgs/msg/CompressedImage", 3)
-        assert found[f"/{camera}/depth/image_raw"] == ("sensor_msgs/msg/Image", 3)
-        assert found[f"/{camera}/color/camera_info"] == ("sensor_msgs/msg/CameraInfo", 3)
-    assert len(found) == 15
+        expected |= {
+            f"/{camera}/color/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", 3),
+            f"/{camera}/depth/image_raw": ("sensor_msgs/msg/Image", 3),
+            f"/{camera}/color/camera_info": ("sensor_msgs/msg/CameraInfo", 3),
+        }
+    assert found == expected
 
 
 def test_the_container_is_a_ros_2_profile_with_checksums_and_full_schemas(recorded: Path) -> None:
@@ -100,12 +101,11 @@ def test_depth_is_in_millimetres_and_camera_info_is_that_of_the_truth(recorded: 
     with AnyReader([recorded / "log.mcap"]) as reader:
         chosen = [c for c in reader.connections if c.topic in ("/cam1/depth/image_raw", "/cam1/color/camera_info")]
         messages = {c.topic: reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)}
-    depth = messages["/cam1/depth/image_raw"]
-    k = truth.cameras[1].intrinsics
-    assert (depth.encoding, depth.width, depth.height, depth.step) == ("16UC1", 64, 48, 128)
+    depth, k = messages["/cam1/depth/image_raw"], truth.cameras[1].intrinsics
+    found = depth.encoding, depth.width, depth.height, depth.step, depth.header.frame_id
+    assert found == ("16UC1", 64, 48, 128, "cam1_optical_frame")
     millimetres = depth.data.view("<u2")
     assert 600 < np.median(millimetres[millimetres > 0]) < 2000
-    assert depth.header.frame_id == "cam1_optical_frame"
     np.testing.assert_array_equal(messages["/cam1/color/camera_info"].k, [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1])
 
 
@@ -115,16 +115,15 @@ def test_a_slim_arm_with_a_tool_has_its_collision_shapes_in_the_urdf_and_the_too
     out = tmp_path / "slim"
     parts = ("--slim", "--unmodelled", "tool,cable", "--noise", "stereo")
     result = splatctrl("simulate", "-o", out, *TINY, *parts, "-q")
-    assert (result.returncode, result.stderr) == (0, "")
-    assert (out / "robot.urdf").read_text() == arm_urdf(SLIM)
+    assert (result.returncode, result.stderr, (out / "robot.urdf").read_text()) == (0, "", arm_urdf(SLIM))
     assert (out / "robot_spheres.yaml").read_bytes() == (recorded / "robot_spheres.yaml").read_bytes()
     document = json.loads((out / "truth.json").read_text())
     assert document["clearance"]["of"] == "moving collision spheres, tool, cable to everything present but the robot"
-    assert load_truth(out / "truth.json").unmodelled == ("tool", "cable")
-    assert load_truth(recorded / "truth.json").unmodelled == ()
-    config = json.loads((out / "run.json").read_text())["config"]
+    parts = [load_truth(folder / "truth.json").unmodelled for folder in (out, recorded)]
+    assert parts == [("tool", "cable"), ()]
+    config, plain = (json.loads((folder / "run.json").read_text())["config"] for folder in (out, recorded))
     assert (config["is_slim"], config["unmodelled"], config["noise"]) == (True, ["tool", "cable"], "stereo")
-    assert "is_slim" not in json.loads((recorded / "run.json").read_text())["config"]
+    assert "is_slim" not in plain
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from tests.control.fakes import PlanarArm, far_away
 from tests.reference.control import braking_room, fr3_velocity_range
 from tests.reference.intervals import velocity_shares
 from tests.refused import expect_refusal
+from tests.robot.shapes import written
 
 NAMES = tuple(f"fr3_joint{number}" for number in range(1, 8))
 CONFIG = ControlConfig()
@@ -45,19 +46,16 @@ def limits(acceleration: float, **changes: float) -> JointLimits:
 
 @pytest.mark.parametrize("acceleration", [0.3, 2.0, 20.0])
 def test_the_merged_box_is_never_empty_wherever_the_arm_is_and_however_it_moved(acceleration: float) -> None:
-    box, random = limits(acceleration), np.random.default_rng(0)
-    free = limits(0.0)
+    box, free, random = limits(acceleration), limits(0.0), np.random.default_rng(0)
     for _ in range(500):
         q, last = random.uniform(-4.0, 4.0, 2), random.uniform(-9.0, 9.0, 2)
-        lowest, highest = box.box(q, last)
+        (lowest, highest), allowed = box.box(q, last), box.box(q)
         assert np.all(lowest <= highest)
-        allowed = box.box(q)
         assert np.all(lowest >= allowed[0]) and np.all(highest <= allowed[1])  # velocity and position come first
         assert np.all(allowed[0] <= allowed[1]) and np.all(np.abs(np.concatenate(allowed)) <= 1.5)
         change = 0.01 * acceleration
         can = np.minimum(allowed[1], last + change) >= np.maximum(allowed[0], last - change)
-        assert np.all(np.abs(np.where(can, lowest - last, 0.0)) <= change + 1e-12)
-        assert np.all(np.abs(np.where(can, highest - last, 0.0)) <= change + 1e-12)
+        assert np.all(np.abs(np.where(can, [lowest - last, highest - last], 0.0)) <= change + 1e-12)
         assert np.all(np.where((q > box.lower) & (q < box.upper), allowed[1] <= free.box(q)[1], True))
 
 
@@ -79,16 +77,14 @@ def test_from_a_state_that_the_box_led_to_the_acceleration_never_gives_way(accel
 def test_no_last_velocity_means_that_no_acceleration_counts() -> None:
     np.testing.assert_array_equal(limits(2.0).box(np.zeros(2)), [[-1.5, -1.5], [1.5, 1.5]])
     np.testing.assert_array_equal([limits(2.0).rest(None), limits(0.0).rest(np.ones(2))], 0.0)
-    np.testing.assert_allclose(limits(2.0).rest(np.array([1.0, -0.01])), [0.98, 0.0])
-    np.testing.assert_allclose(limits(2.0).rest(np.array([0.01, -1.0])), [0.0, -0.98])
+    slowed = [limits(2.0).rest(np.array(last)) for last in ([1.0, -0.01], [0.01, -1.0])]
+    np.testing.assert_allclose(slowed, [[0.98, 0.0], [0.0, -0.98]])
 
 
 def test_accelerations_come_for_all_joints_or_one_by_one(tmp_path: Path) -> None:
-    path = tmp_path / "config.toml"
-    path.write_text("[control]\nmax_acceleration = [1.0, 2]\n")
-    config = load_config(path, []).control
-    assert config.max_acceleration == (1.0, 2.0)
-    np.testing.assert_array_equal(JointLimits.of(PlanarArm(), config).acceleration, [1.0, 2.0])
+    config = load_config(written(tmp_path, "[control]\nmax_acceleration = [1.0, 2]\n", "config.toml"), []).control
+    found = JointLimits.of(PlanarArm(), config).acceleration
+    assert (config.max_acceleration, np.asarray(found).tolist()) == ((1.0, 2.0), [1.0, 2.0])
     assert limits(0.0).acceleration is None
 
 
@@ -126,9 +122,9 @@ def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:
     )
     np.testing.assert_allclose(merged.box(np.zeros(2))[1], [1.0, 2.62])
     np.testing.assert_allclose(merged.box(near)[1], np.minimum(by_position(near)[1], [1.0, 9.0]))
-    for q in (np.array([3.0, 2.0]), np.array([-3.0, -2.0])):
-        lowest, highest = merged.box(q)
-        assert np.all(lowest <= highest) and np.all(np.sign(highest + lowest) == -np.sign(q))
+    for sign in (1, -1):
+        lowest, highest = merged.box(sign * np.array([3.0, 2.0]))
+        assert np.all(lowest <= highest) and np.all(np.sign(highest + lowest) == -sign)
 
 
 @pytest.mark.parametrize("names", [("elbow",), ("fr3_joint1", "fr3_finger_joint1")])
@@ -199,8 +195,8 @@ def test_a_joint_that_jumps_by_pi_for_a_moment_is_too_fast() -> None:
     positions = np.zeros((50, 2))
     positions[20:25, 1] = np.pi  # 0.1 s
     found = MotionLimits(LIMIT, None).add(at_rate(50), positions)
-    assert found.velocity_joint[found.velocity > 100].tolist() == [1, 1]
-    assert np.flatnonzero(found.velocity > 100).tolist() == [20, 25]
+    (states,) = np.nonzero(found.velocity > 100)
+    assert (states.tolist(), found.velocity_joint[states].tolist()) == ([20, 25], [1, 1])
 
 
 def test_shares_are_those_of_the_reference() -> None:

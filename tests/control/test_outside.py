@@ -19,9 +19,9 @@ from splatctrl_cli.control.line_process import Fault
 from splatctrl_cli.control.outside import OutsideController, Program, class_command
 from splatctrl_cli.control.qp import Rung
 from splatctrl_cli.control.replay import OpenLoopTask, Outcome, ReplayTask, ReplayTrace, closed_loop, open_loop
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm, far_away
+from tests.refused import expect_refusal
 
 CONFIG = ControlConfig()
 START, END = np.array([0.3, 0.4]), np.array([0.6, 0.5])
@@ -141,9 +141,7 @@ def test_a_fault_ends_the_motion_and_is_kept_by_name(name: str, monkeypatch: pyt
     ],
 )
 def test_what_does_not_start_is_refused(command: tuple[str, ...], words: str) -> None:
-    with pytest.raises(InputError) as found:
-        make_controller(command)
-    assert str(found.value).startswith("it: ") and words in str(found.value) and found.value.remedy
+    assert expect_refusal(words, make_controller, command, has_remedy=True).startswith("it: ")
 
 
 def test_a_program_that_prints_nothing_is_not_waited_for_nor_one_for_longer_than_its_run(
@@ -153,8 +151,8 @@ def test_a_program_that_prints_nothing_is_not_waited_for_nor_one_for_longer_than
     _, commander = driven(at_third("time.sleep(0.3)"))
     assert commander.failure.fault is Fault.OUT_OF_TIME
     monkeypatch.setattr(outside, "START_LIMIT", 0.5)
-    with pytest.raises(InputError, match=r"at the start: hung: no answer within 0\.5 s"):
-        make_controller(program("import time; time.sleep(60)"), step_limit=0.1)
+    sleeping = program("import time; time.sleep(60)")
+    expect_refusal("at the start: hung: no answer within 0.5 s", make_controller, sleeping, step_limit=0.1)
 
 
 def test_a_program_and_what_it_started_are_ended(tmp_path: Path) -> None:

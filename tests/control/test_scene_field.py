@@ -77,12 +77,20 @@ def test_its_gradient_is_the_slope_of_its_distance() -> None:
     np.testing.assert_allclose(field.query(points)[1], np.stack(slopes, axis=1), atol=1e-6)
 
 
-def test_without_people_or_a_larger_margin_the_scene_is_what_counts() -> None:
-    scene, people = balls(THING), balls(PERSON)
-    assert guard_people(scene, None, ControlConfig(human_margin=0.3)) is scene
-    assert guard_people(scene, people, ControlConfig()) is scene
-    assert guard_people(scene, people, ControlConfig(margin=0.05, human_margin=0.05)) is scene
-    assert guard_people(scene, people, ControlConfig(human_margin=0.3)) is not scene
+@pytest.mark.parametrize(
+    ("has_people", "changes", "is_guarded"),
+    [
+        (False, {"human_margin": 0.3}, False),
+        (True, {}, False),
+        (True, {"margin": 0.05, "human_margin": 0.05}, False),
+        (True, {"human_margin": 0.3}, True),
+    ],
+)
+def test_without_people_or_a_larger_margin_the_scene_is_what_counts(
+    has_people: bool, changes: dict[str, float], is_guarded: bool
+) -> None:
+    scene, people = balls(THING), balls(PERSON) if has_people else None
+    assert (guard_people(scene, people, ControlConfig(**changes)) is not scene) == is_guarded  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -129,10 +137,10 @@ def test_a_start_is_free_where_the_links_own_surface_is() -> None:
     """A ball 1 cm deep in a sphere alone, and one as deep in the surface."""
     for radius, depth in ((0.07, "0.0100"), (0.09, "0.0300")):
         centers, radii = [[0.9, 0.1, 0.0]], [radius]
-        with pytest.raises(NotEvaluableError, match=rf"sphere fore\[1\] {depth} m deep"):
-            check_free(ThinArm(), Balls(centers, radii), Q)
-    with pytest.raises(NotEvaluableError, match=r"sphere fore\[1\] 0\.0100 m deep"):
-        check_free(ThinArm(), Balls(centers, radii), Q, scene_of(centers, radii))
+        deep = ThinArm(), Balls(centers, radii), Q
+        expect_refusal(f"sphere fore[1] {depth} m deep", check_free, *deep, error=NotEvaluableError)
+    scene = scene_of(centers, radii)
+    expect_refusal("sphere fore[1] 0.0100 m deep", check_free, *deep, scene, error=NotEvaluableError)
     check_free(ThinArm(), Balls(centers, [0.07]), Q, scene_of(centers, [0.07]))
 
 
@@ -206,8 +214,7 @@ def test_what_is_seen_for_the_first_time_did_not_come_and_stands_there_from_then
 def test_what_one_scene_alone_has_is_noise() -> None:
     """A thing that comes by 5 cm a scene is there in each; one that is elsewhere in the next was nowhere."""
     assert looked(beside(0.1), beside(0.0), beside(0.1), beside(0.0))["base[0]"][1] == pytest.approx(0.1)
-    coming = [beside(gap) for gap in (0.1, 0.06, 0.035, 0.01)]
-    assert looked(*coming)["base[0]"][1] == pytest.approx(0.03)
+    assert looked(*map(beside, (0.1, 0.06, 0.035, 0.01)))["base[0]"][1] == pytest.approx(0.03)
 
 
 def test_each_sphere_has_what_is_nearest_to_it() -> None:

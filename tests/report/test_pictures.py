@@ -39,6 +39,7 @@ from splatctrl_cli.report.replay_pictures import (
     spans,
 )
 from tests.quick import painted
+from tests.refused import expect_refusal
 
 __all__ = ["painted"]
 
@@ -171,8 +172,7 @@ def test_a_sphere_is_drawn_as_the_circle_of_the_cut(tmp_path: Path) -> None:
         field_slice_picture(tmp_path / "a.png", grid(), 0.5, sphere, "A ball")
         areas.append(num_orange(picture(tmp_path / "a.png")))
     whole, small = areas[0] - areas[2], areas[1] - areas[2]
-    assert whole > 1000
-    assert small / whole == pytest.approx(0.6**2, rel=0.05), "sqrt(0.1^2 - 0.08^2) = 0.06"
+    assert whole > 1000 and small / whole == pytest.approx(0.6**2, rel=0.05), "sqrt(0.1^2 - 0.08^2) = 0.06"
 
 
 def num_orange(image: UInt8) -> int:
@@ -182,8 +182,7 @@ def num_orange(image: UInt8) -> int:
 
 def panel(image: UInt8, right: bool) -> UInt8:
     """The middle of an error's panel."""
-    height = image.shape[0]
-    x = 860 if right else 260
+    height, x = image.shape[0], 860 if right else 260
     return image[int(0.7 * height) : int(0.8 * height), x - 60 : x + 60]
 
 
@@ -242,8 +241,7 @@ def test_a_column_is_read_by_blocks(monkeypatch: pytest.MonkeyPatch, block: int)
 
 def test_a_long_series_keeps_its_extremes_where_they_are() -> None:
     rng = np.random.default_rng(0)
-    seconds = np.sort(rng.uniform(0, 100, 5000))
-    values = rng.normal(size=5000)
+    seconds, values = np.sort(rng.uniform(0, 100, 5000)), rng.normal(size=5000)
     values[1234], values[4321] = -50.0, 70.0
     times, lowest, highest = envelope(seconds, values, columns=100)
     assert lowest is not highest and len(times) == 100
@@ -278,10 +276,9 @@ def test_short_intervals_can_be_seen_and_those_that_touch_are_one() -> None:
 def test_a_picture_of_trials_has_a_colour_for_each_group_and_leaves_out_what_a_method_lacks(tmp_path: Path) -> None:
     values = np.array([[1.0, 2.0], [1.5, np.nan], [2.0, 3.0]])
     panels = [Panel(title="time [s]", values=values, level=(1.2, "alone")), Panel(title="distance", values=values)]
-    trials_picture(tmp_path / "a.png", ["one", "other"], panels, ["near", "near", "far"], "Trials")
-    trials_picture(tmp_path / "b.png", ["one", "other"], panels, ["near", "near", "far"], "Trials")
+    for name, groups in (("a", ["near", "near", "far"]), ("b", ["near", "near", "far"]), ("c", ["near"] * 3)):
+        trials_picture(tmp_path / f"{name}.png", ["one", "other"], panels, groups, "Trials")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    trials_picture(tmp_path / "c.png", ["one", "other"], panels, ["near"] * 3, "Trials")
     for name, num in (("a", 2), ("c", 1)):  # without other groups there is no legend
         image = picture(tmp_path / f"{name}.png")
         assert image.shape[1] == 1200
@@ -298,8 +295,7 @@ def test_a_probability_that_is_drawn_by_itself_is_reliable() -> None:
     curve = reliability(probability, rng.uniform(0, 1, 200_000) < probability)
     np.testing.assert_allclose(curve.predicted, np.arange(0.05, 1, 0.1), atol=2e-3)
     np.testing.assert_allclose(curve.observed, curve.predicted, atol=0.02)
-    assert curve.calibration_error < 0.005
-    assert curve.count.sum() == 200_000
+    assert curve.calibration_error < 0.005 and curve.count.sum() == 200_000
 
 
 def test_bins_hold_what_they_say() -> None:
@@ -327,5 +323,4 @@ def test_bins_hold_what_they_say() -> None:
     ],
 )
 def test_what_cannot_be_drawn_is_refused(tmp_path: Path, draw: Callable[[Path], object], words: str) -> None:
-    with pytest.raises((NotEvaluableError, UsageError), match=words):
-        draw(tmp_path / "a.png")
+    expect_refusal(words, draw, tmp_path / "a.png", error=(NotEvaluableError, UsageError))

@@ -82,9 +82,8 @@ def test_the_legend_has_the_least_value_of_each_measure() -> None:
 def test_a_primitive_is_drawn_in_its_place_and_size(
     kind: str, size: tuple[float, ...], extents: tuple[float, ...]
 ) -> None:
-    T = pose_at([1.0, 2.0, 3.0])
-    surface = RobotSurface.from_parts([Shape(link="hand", kind=kind, size=size, T_link_shape=T)])
-    vertices = bodies_of(surface)["hand"].vertices
+    shape = Shape(link="hand", kind=kind, size=size, T_link_shape=pose_at([1.0, 2.0, 3.0]))
+    vertices = bodies_of(RobotSurface.from_parts([shape]))["hand"].vertices
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     np.testing.assert_allclose(upper - lower, extents, rtol=0.02)
     np.testing.assert_allclose((upper + lower) / 2, [1.0, 2.0, 3.0], atol=1e-3)

@@ -19,6 +19,7 @@ from splatctrl_cli.simulate.arm import (
 )
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import distance_to
+from tests.robot.shapes import written
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +94,7 @@ def test_the_committed_robot_files_are_what_the_code_writes(plain_arm: Path) -> 
 def test_visual_shapes_lie_3_mm_inside_of_collision_shapes_and_a_twentieth_27_to_30_mm(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
-    urdf = read_urdf(tmp_path / "robot.urdf")
+    urdf = read_urdf(written(tmp_path, arm_urdf(SLIM)))
     seen, gaps, areas = visual_urdf(urdf), [], []
     for link in SHAPES:
         outer, inner = ([shape for shape in of.shapes if shape.link == link] for of in (urdf, seen))
@@ -112,8 +112,7 @@ def test_visual_shapes_lie_3_mm_inside_of_collision_shapes_and_a_twentieth_27_to
     order = np.argsort(gap)
     share = np.cumsum(area[order]) / area.sum()
     median, most = (gap[order][np.searchsorted(share, level)] for level in (0.5, 0.95))
-    assert median == pytest.approx(0.003, abs=1e-4)
-    assert most == pytest.approx(0.027, abs=1e-3)
+    assert (median, most) == (pytest.approx(0.003, abs=1e-4), pytest.approx(0.027, abs=1e-3))
     assert gap.max() < 0.030 + 1e-6
 
 
@@ -126,11 +125,11 @@ def area_of(shape: Shape) -> float:
 
 
 def test_the_slim_arm_collides_as_the_other_does(arm: RobotModel, tmp_path: Path) -> None:
-    (tmp_path / "robot.urdf").write_text(arm_urdf(SLIM))
-    urdf = read_urdf(tmp_path / "robot.urdf")
-    assert [(s.link, s.kind, s.size) for s in urdf.shapes] == [(s.link, s.kind, s.size) for s in arm.urdf.shapes]
-    same = visual_urdf(arm.urdf)
-    assert [(s.link, s.kind, s.size) for s in same.shapes] == [(s.link, s.kind, s.size) for s in arm.urdf.shapes]
+    slim, same, shapes = (
+        [(s.link, s.kind, s.size) for s in urdf.shapes]
+        for urdf in (read_urdf(written(tmp_path, arm_urdf(SLIM))), visual_urdf(arm.urdf), arm.urdf)
+    )
+    assert slim == same == shapes
 
 
 @pytest.mark.parametrize("name", UNMODELLED)

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.shared_workspace import scene_of
 from splatctrl_cli.config import fixed
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import pose_at
 from splatctrl_cli.jobs.simulate.simulate import adapt_motion
 from splatctrl_cli.records import Float64, SphereSet
@@ -115,9 +115,9 @@ def test_a_small_arm_goes_as_far_as_it_reaches_and_a_tiny_one_is_refused(tmp_pat
         assert tip[2] == pytest.approx(hand[2], abs=2e-3)
         assert np.linalg.norm(tip[:2]) < np.linalg.norm(hand[:2]) + 1e-3
         assert tip[0] * hand[1] - tip[1] * hand[0] == pytest.approx(0.0, abs=2e-3)
-    with pytest.raises(InputError, match=r"expected tool0 to reach .* pointing down, got no posture; give the URDF"):
-        tiny = ur10e(tmp_path, scaled(0.05))
-        adapt_motion(scene, tiny, SelfSurfaces(tiny, {}))
+    tiny = ur10e(tmp_path, scaled(0.05))
+    words = r"expected tool0 to reach .* pointing down, got no posture; give the URDF"
+    expect_refusal(words, adapt_motion, scene, tiny, SelfSurfaces(tiny, {}))
 
 
 def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path) -> None:
@@ -154,9 +154,8 @@ def test_another_arm_keeps_its_velocity_limits_in_any_time(tmp_path: Path, durat
 
 def test_an_arm_that_is_too_slow_for_its_task_beside_a_person_is_refused(tmp_path: Path) -> None:
     slow = ur10e(tmp_path, re.sub(r'velocity="[^"]+"', 'velocity="0.2"', ur10e_urdf()))
-    scene = scene_of("near-goal", 0)
-    with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
-        adapt_motion(scene, slow, SelfSurfaces(slow, {}))
+    given = scene_of("near-goal", 0), slow, SelfSurfaces(slow, {})
+    expect_refusal("expected a way between the waypoints, got none", adapt_motion, *given)
 
 
 def test_free_space_has_floor_and_walls_alone() -> None:

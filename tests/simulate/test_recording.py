@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.formats.mesh import load_mesh
 from splatctrl_cli.geometry import back_project, pose_at, transform_points
-from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.records import Float64, JointState, RgbdFrame
 from splatctrl_cli.robot.coverage import coverage_of_solids
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
@@ -81,12 +81,12 @@ def test_the_visitor_comes_after_a_third_and_leaves_after_two(exact: Recording) 
 
 
 def test_the_visitor_stands_where_it_is_asked_to(robot: RobotModel) -> None:
-    options = RecordingOptions(visitor=(0.5, -0.1, 0.09))
-    visitor = Recording(options, robot).primitives[-1]
-    assert (visitor.T_world_shape[:3, 3].tolist(), visitor.size) == ([0.5, -0.1, 0.15], (0.09, 0.30))
-    assert [p.name for p in Recording(options, robot).primitives] == [
-        p.name for p in Recording(RecordingOptions(), robot).primitives
-    ]
+    asked, plain = (
+        Recording(options, robot).primitives
+        for options in (RecordingOptions(visitor=(0.5, -0.1, 0.09)), RecordingOptions())
+    )
+    assert (asked[-1].T_world_shape[:3, 3].tolist(), asked[-1].size) == ([0.5, -0.1, 0.15], (0.09, 0.30))
+    assert [p.name for p in asked] == [p.name for p in plain]
 
 
 def test_training_images_have_contrast_and_the_arm_is_in_sight(exact: Recording, frames: list[RgbdFrame]) -> None:
@@ -145,14 +145,18 @@ def test_the_same_seed_gives_the_same_images_and_another_seed_others(robot: Robo
     assert (depth[0] != depth[2]).any()
 
 
-def test_clearance_is_that_of_the_nearest_moving_sphere(exact: Recording) -> None:
-    stamps, clearance = exact.clearances()
+def least(recording: Recording) -> tuple[float, int, Float64]:
+    """The least true clearance, its stamp, and the posture there."""
+    stamps, clearance = recording.clearances()
     index = int(np.argmin(clearance))
-    q = list(exact.joint_states())[index].position
+    return float(clearance[index]), int(stamps[index]), list(recording.joint_states())[index].position
+
+
+def test_clearance_is_that_of_the_nearest_moving_sphere(exact: Recording) -> None:
+    found, stamp, q = least(exact)
     moving = exact.robot.moving_spheres
-    by_hand = distance_to(exact.primitives, exact.robot.sphere_centers(q)[moving], int(stamps[index]))
-    assert clearance[index] == np.min(by_hand - exact.robot.sphere_set.radii[moving])
-    assert 0.03 < clearance[index] < 0.10
+    by_hand = distance_to(exact.primitives, exact.robot.sphere_centers(q)[moving], stamp)
+    assert 0.03 < found < 0.10 and found == np.min(by_hand - exact.robot.sphere_set.radii[moving])
 
 
 @pytest.mark.parametrize("pattern", ["noise", "stripes", "checks"])
@@ -160,8 +164,7 @@ def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> Non
     texture = Texture(pattern=pattern, feature=0.1, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
     points = np.random.default_rng(0).uniform(-2, 2, (20_000, 3))
     color = texture.color(points)
-    assert (color >= np.array(texture.dark) - 1e-12).all()
-    assert (color <= np.array(texture.bright) + 1e-12).all()
+    assert (np.clip(color, np.array(texture.dark) - 1e-12, np.array(texture.bright) + 1e-12) == color).all()
     assert color[:, 0].std() > 0.15
     assert np.abs(texture.color(points + 1e-5) - color).max() < 1e-3
 
@@ -209,8 +212,7 @@ def test_truth_reads_back_and_measures_the_same(exact: Recording, tmp_path: Path
         np.testing.assert_array_equal(found.distance(points, stamp), truth.distance(points, stamp))
     assert [p.name for p in found.primitives] == [p.name for p in truth.primitives]
     assert [(c.name, c.is_training) for c in found.cameras] == [(f"cam{i}", i < 3) for i in range(4)]
-    assert found.robot_urdf == tmp_path / "robot.urdf"
-    np.testing.assert_array_equal(found.stamps, truth.stamps)
+    assert (found.robot_urdf, found.stamps.tolist()) == (tmp_path / "robot.urdf", truth.stamps.tolist())
     np.testing.assert_allclose(found.clearance, truth.clearance, atol=1e-6)
 
 
@@ -243,8 +245,7 @@ def test_what_is_no_truth_file_is_refused(tmp_path: Path, text: str | None, mess
 def test_the_sample_keeps_its_promises(sample_data: Path) -> None:
     folder = sample_data / "tabletop"
     truth = load_truth(folder / "truth.json")
-    assert truth.robot_urdf.is_file()
-    assert truth.robot_spheres.is_file()
+    assert truth.robot_urdf.is_file() and truth.robot_spheres.is_file()
     assert all(truth.luminance_std[camera.name] >= 0.15 for camera in truth.cameras if camera.is_training)
     assert 0.03 < truth.clearance.min() < 0.05
     assert sum(path.stat().st_size for path in sample_data.rglob("*") if path.is_file()) < 10e6
@@ -271,8 +272,7 @@ def test_a_person_walks_by_and_the_masks_show_where(robot: RobotModel) -> None:
             assert ((np.abs(distance) < 1e-5) >= is_shown).all()
             assert is_shown[distance < -1e-5].all()
             places.append(float(here[0].T_world_shape[0, 3]))
-    assert len(set(places)) == 3
-    assert places == sorted(places, reverse=True)
+    assert (len(set(places)), places) == (3, sorted(places, reverse=True))
 
 
 def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
@@ -302,11 +302,9 @@ def test_an_unmodelled_part_is_in_the_images_and_the_truth_and_not_in_the_robot(
 
 def test_the_true_clearance_of_a_part_is_its_own_to_a_millimetre(robot: RobotModel, exact: Recording) -> None:
     recording = Recording(RecordingOptions(**SMALL), robot, unmodelled=("tool",))
-    stamps, clearance = recording.clearances()
-    index = int(np.argmin(clearance))
-    q = list(recording.joint_states())[index].position
+    found, stamp, q = least(recording)
     (tool,) = UNMODELLED["tool"][1]
     axis = transform_points(robot.frame_pose(q, "hand"), np.linspace(tool.start, tool.end, 1000))
-    expected = distance_to(recording.primitives, axis, int(stamps[index])).min() - tool.radius
-    assert expected <= clearance[index] < expected + 1e-3
-    assert clearance[index] < exact.clearances()[1].min() - 0.01
+    expected = distance_to(recording.primitives, axis, stamp).min() - tool.radius
+    assert expected <= found < expected + 1e-3
+    assert found < exact.clearances()[1].min() - 0.01

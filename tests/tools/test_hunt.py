@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
 from tools.hunt.outcome import word_of
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.trial import BEFORE_CAMERAS, Trial, box_of, config_of, draw, family_of, record, true_robot
+from tools.hunt.trial import BEFORE_CAMERAS, Trial, box_of, config_of, draw, family_of, record
 from tools.hunt.world import (
     BOX,
     DURATION_S,
@@ -40,22 +41,17 @@ from tools.hunt.world import (
 )
 
 START = np.array([-0.1, 0.1, 0.0, -1.9, 0.0, 2.1, 0.4])
+AT_REST = interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
 GREY = Texture(pattern="checks", feature=0.05, dark=(0.1, 0.1, 0.1), bright=(0.9, 0.9, 0.9))
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
-    return true_robot(tmp_path_factory.mktemp("robot"))
 
 
 def ball(place: np.ndarray, radius: float = 0.05, name: str = "target") -> Primitive:
     return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=pose_at(place), texture=GREY)
 
 
-def world_of(target: Primitive, motion: Motion | None = None) -> World:
-    still = Motion(times=np.array([0.0, 0.6, 2.5]), waypoints=np.array([START, START, START + 0.2]))
-    cameras = draw_cameras(np.random.default_rng(0))
-    return World(motion=motion or still, things=(table(),), targets=(target,), cameras=cameras)
+def world_of(target: Primitive) -> World:
+    motion = Motion(times=np.array([0.0, 0.6, 2.5]), waypoints=np.array([START, START, START + 0.2]))
+    return World(motion=motion, things=(table(),), targets=(target,), cameras=draw_cameras(np.random.default_rng(0)))
 
 
 def in_view() -> Primitive:
@@ -64,6 +60,20 @@ def in_view() -> Primitive:
 
 def shown_of(world: World, fault: Fault, model: RobotModel, folder: Path) -> Shown:
     return Recorder(world, fault, model, (0, 0)).write(folder / "log.mcap")
+
+
+def beside(model: RobotModel, link: str, *offset: float, radius: float = 0.05) -> Primitive:
+    """A ball at an offset [m] in the frame of a link."""
+    return ball((model.frame_pose(START, link) @ [*offset, 1.0])[:3], radius)
+
+
+def clearance_at_start(arm: TrueArm, target: Primitive) -> float:
+    return float(arm.clearances([target], np.array([at_s(0)]), START[None])[0])
+
+
+def least_at_rest(model: RobotModel, target: Primitive) -> tuple[float, float]:
+    """The least clearance of an arm that stays in START for three seconds, and its stamp."""
+    return least_clearance(TrueArm(model), [target], AT_REST, at_s(0), at_s(3))
 
 
 Recorded = Callable[[Fault], tuple[Shown, Path]]
@@ -94,19 +104,17 @@ def read(folder: Path) -> tuple[list[JointState], list[RgbdFrame]]:
 # --- the truth ---
 
 
-def test_the_clearance_of_a_ball_beside_the_hand_is_the_distance_to_its_palm(model: RobotModel) -> None:
-    T = model.frame_pose(START, "hand")
-    for gap in (0.04, 0.003, -0.01):
-        place = (T @ [0.025 + 0.05 + gap, 0.0, 0.033, 1.0])[:3]
-        found = TrueArm(model).clearances([ball(place)], np.array([at_s(0)]), START[None])[0]
-        assert abs(found - gap) < 1e-6
-
-
-def test_the_clearance_of_a_ball_beside_a_capsule_is_exact_between_its_ends(model: RobotModel) -> None:
-    T = model.frame_pose(START, "link5")  # a capsule of 52 mm from z = -0.25 to -0.19
-    place = (T @ [-0.052 - 0.05 - 0.02, 0.0, -0.25, 1.0])[:3]
-    found = TrueArm(model).clearances([ball(place)], np.array([at_s(0)]), START[None])[0]
-    assert abs(found - 0.02) < 1e-6
+@pytest.mark.parametrize(
+    ("link", "offset", "clearance"),
+    [
+        *(("hand", (0.025 + 0.05 + gap, 0.0, 0.033), gap) for gap in (0.04, 0.003, -0.01)),  # beside its palm
+        ("link5", (-0.052 - 0.05 - 0.02, 0.0, -0.25), 0.02),  # a capsule of 52 mm from z = -0.25 to -0.19
+    ],
+)
+def test_the_clearance_of_a_ball_beside_a_link_is_exact(
+    model: RobotModel, link: str, offset: tuple[float, ...], clearance: float
+) -> None:
+    assert abs(clearance_at_start(TrueArm(model), beside(model, link, *offset)) - clearance) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere"])
@@ -124,45 +132,37 @@ def test_the_clearance_is_no_more_than_that_of_any_point_of_the_surface(model: R
             T * np.sign(np.linalg.det(T)),
         )
         solid = replace(ball(np.zeros(3)), kind=kind, size=size, T_world_shape=pose)
-        found = arm.clearances([solid], np.array([at_s(0)]), START[None])[0]
+        found = clearance_at_start(arm, solid)
         sampled = float(signed_distance(solid, world_points).min())
         assert found < 0 if sampled < 0 else found <= sampled + 1e-4
 
 
 def test_the_least_clearance_is_found_between_two_samples(model: RobotModel) -> None:
-    T = model.frame_pose(START, "hand")
-    place, away = (T @ [0.025 + 0.05 + 0.004, 0.0, 0.033, 1.0])[:3], T[:3, 0]  # 4 mm beside the palm, for a moment
-    target = moving(ball(place), [0.6, 1.0073, 1.4], np.array([0.4 * away, 0 * away, 0.4 * away]))  # at 1 m/s
-    arm, still = TrueArm(model), interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
-    found, when = least_clearance(arm, [target], still, at_s(0), at_s(3))
-    assert abs(found - 0.004) < 3e-4
-    assert abs(when - at_s(1.0073)) < 1e6
+    near = beside(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm beside the palm, for a moment
+    away = 0.4 * model.frame_pose(START, "hand")[:3, 0]
+    found, when = least_at_rest(model, moving(near, [0.6, 1.0073, 1.4], np.array([away, 0 * away, away])))  # at 1 m/s
+    assert (found, when) == (pytest.approx(0.004, abs=3e-4), pytest.approx(at_s(1.0073), abs=1e6))
 
 
 def test_a_ball_that_passes_a_round_link_is_nearest_between_two_samples(model: RobotModel) -> None:
-    T = model.frame_pose(START, "link6")  # a capsule of 48 mm along x
-    passing = ball((T @ [0.044, -0.048 - 0.01 - 0.004, 0.0, 1.0])[:3], 0.01)
-    target = moving(passing, [1.0, 1.58], np.array([-0.29 * T[:3, 2], 0.29 * T[:3, 2]]))  # nearest at 1.29 s
-    arm, still = TrueArm(model), interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
-    found, when = least_clearance(arm, [target], still, at_s(0), at_s(3))
+    side = 0.29 * model.frame_pose(START, "link6")[:3, 2]
+    passing = beside(model, "link6", 0.044, -0.048 - 0.01 - 0.004, 0.0, radius=0.01)  # a capsule of 48 mm along x
+    target = moving(passing, [1.0, 1.58], np.array([-side, side]))  # nearest at 1.29 s
+    found, when = least_at_rest(model, target)
     fine = np.arange(at_s(1.28), at_s(1.30), 100_000)
-    assert abs(found - arm.clearances([target], fine, still(fine)).min()) < 2e-4
+    assert abs(found - TrueArm(model).clearances([target], fine, AT_REST(fine)).min()) < 2e-4
     assert abs(when - at_s(1.29)) < 5e6
 
 
 def test_what_is_there_for_a_millisecond_alone_counts(model: RobotModel) -> None:
-    hand = model.frame_pose(START, "hand")[:3, 3]
-    positions = interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
-    target = during(ball(hand), 1.0007, 1.0017)
-    assert least_clearance(TrueArm(model), [target], positions, at_s(0), at_s(3))[0] < 0
+    assert least_at_rest(model, during(beside(model, "hand", 0.0, 0.0, 0.0), 1.0007, 1.0017))[0] < 0
 
 
 def test_a_tool_that_no_model_has_counts(model: RobotModel) -> None:
     tool = Capsule(start=(0.0, 0.0, 0.08), end=(0.0, 0.0, 0.2), radius=0.02)
-    target = ball((model.frame_pose(START, "hand") @ [0.0, 0.0, 0.2 + 0.02 + 0.05 + 0.01, 1.0])[:3])
-    at = np.array([at_s(0)])
-    assert abs(TrueArm(model, tool).clearances([target], at, START[None])[0] - 0.01) < 1e-6
-    assert TrueArm(model).clearances([target], at, START[None])[0] > 0.05
+    target = beside(model, "hand", 0.0, 0.0, 0.2 + 0.02 + 0.05 + 0.01)
+    assert abs(clearance_at_start(TrueArm(model, tool), target) - 0.01) < 1e-6
+    assert clearance_at_start(TrueArm(model), target) > 0.05
 
 
 # --- the faults are in the data ---
@@ -205,15 +205,18 @@ def test_a_dark_target_returns_no_depth_and_keeps_its_outline(recorded: Recorded
     assert recorded(Fault())[0].target.sum() > 50
 
 
-def test_logged_joints_and_commands_are_each_others_inverse() -> None:
-    q = np.random.default_rng(0).standard_normal((5, 7))
-    for fault in (
+@pytest.mark.parametrize(
+    "fault",
+    [
         Fault(order=(2, 0, 1, 3, 4, 5, 6)),
         Fault(offset=(0.1, 0, 0, 0, 0, -0.2, 0)),
         Fault(in_degrees=True, order=(1, 0, 2, 3, 4, 5, 6)),
-    ):
-        assert not np.allclose(fault.logged(q), q)
-        assert np.allclose(fault.true_of(fault.logged(q)), q)
+    ],
+)
+def test_logged_joints_and_commands_are_each_others_inverse(fault: Fault) -> None:
+    q = np.random.default_rng(0).standard_normal((5, 7))
+    assert not np.allclose(fault.logged(q), q)
+    assert np.allclose(fault.true_of(fault.logged(q)), q)
 
 
 def test_a_longer_link_is_longer_by_that_much(model: RobotModel, tmp_path: Path) -> None:
@@ -227,24 +230,22 @@ def test_a_longer_link_is_longer_by_that_much(model: RobotModel, tmp_path: Path)
 def test_each_family_spoils_or_places_something(family: str) -> None:
     for seed in range(20):
         draft = FAMILIES[family](np.random.default_rng(seed))
-        is_clean = draft.fault == Fault() and draft.tool is None and draft.cameras == CAMERAS
-        is_clean &= draft.distance == 1 and not draft.settings
-        is_clean &= draft.box_gap is None
-        assert is_clean == (family in ("benign", "thin", "touch", "visit", "people", "still"))
+        changes = draft.fault, draft.tool, draft.cameras, draft.distance, draft.box_gap, bool(draft.settings)
+        assert (changes == (Fault(), None, CAMERAS, 1, None, False)) == (
+            family in ("benign", "thin", "touch", "visit", "people", "still")
+        )
 
 
 def drawn(model: RobotModel, family: str, seed: int = 500) -> Trial:
-    return draw(seed, next(i for i in range(40) if family_of(seed, i) == family), model)
+    return draw(seed, next(i for i in range(60) if family_of(seed, i) == family), model)
 
 
 @pytest.mark.parametrize("repeats_color", [True, False])
 def test_repeated_frames_have_new_stamps_and_the_depth_of_the_last_one(
     repeats_color: bool, model: RobotModel, tmp_path: Path
 ) -> None:
-    still = Motion(times=np.array([0.0, 0.6, 2.5]), waypoints=np.array([START, START, START + 0.2]))
-    shown = shown_of(world_of(in_view(), still), Fault(repeated=6, repeats_color=repeats_color), model, tmp_path)
-    frames = [r for r in open_source(tmp_path / "log.mcap").records() if isinstance(r, RgbdFrame)]
-    mine = [frame for frame in frames if frame.camera == "cam0"]
+    shown = shown_of(world_of(in_view()), Fault(repeated=6, repeats_color=repeats_color), model, tmp_path)
+    mine = [frame for frame in read(tmp_path)[1] if frame.camera == "cam0"]
     assert len({frame.stamp_ns for frame in mine}) == NUM_FRAMES
     assert all((frame.depth == mine[5].depth).all() for frame in mine[6:])
     assert all((frame.color == mine[5].color).all() == repeats_color for frame in mine[9:])
@@ -260,7 +261,7 @@ def test_a_target_measured_behind_its_place_is_seen_where_its_rays_meet_the_tabl
     shown = shown_of(world_of(in_view()), fault, model, tmp_path)
     assert shown.target.any()
     assert (shown.target <= shown.target_outline).all()
-    (frame, *_) = [r for r in open_source(tmp_path / "log.mcap").records() if isinstance(r, RgbdFrame)]
+    (frame, *_) = read(tmp_path)[1]
     assert fault.instead is None or np.isclose(frame.depth.max(), 4.0, atol=1e-3)
     high = world_of(ball(np.array([0.55, 0.1, 0.6])))
     (tmp_path / "high").mkdir()
@@ -288,11 +289,16 @@ def test_a_box_ends_before_the_plate(model: RobotModel) -> None:
     assert box_of(drawn(model, "still")) is BOX
 
 
-@pytest.mark.parametrize(("how", "word"), [("", "safe"), ("proven", "safe"), ("waived", "waived")])
-def test_what_passed_by_a_waiver_is_no_safe_run(how: str, word: str) -> None:
-    passed, failed = (Reason(outcome=outcome, sentence="") for outcome in (Outcome.PASSED, Outcome.FAILED))
-    assert word_of(verdict_of("replay", [passed], how=how), known_near(), 0.02).word == word
-    assert word_of(verdict_of("replay", [failed], how=how), known_near(), 0.02).word == "failed"
+@pytest.mark.parametrize(
+    ("outcome", "how", "word"),
+    [
+        *((Outcome.PASSED, how, word) for how, word in (("", "safe"), ("proven", "safe"), ("waived", "waived"))),
+        *((Outcome.FAILED, how, "failed") for how in ("", "proven", "waived")),
+    ],
+)
+def test_what_passed_by_a_waiver_is_no_safe_run(outcome: Outcome, how: str, word: str) -> None:
+    verdict = verdict_of("replay", [Reason(outcome=outcome, sentence="")], how=how)
+    assert word_of(verdict, known_near(), 0.02).word == word
 
 
 def known_near(**changes: float) -> Any:
@@ -303,42 +309,50 @@ def known_near(**changes: float) -> Any:
     return near | far | {name: np.array([value]) for name, value in changes.items()}
 
 
-def test_a_run_names_the_one_limit_without_which_it_is_safe() -> None:
-    lacking = Reason(outcome=Outcome.NOT_EVALUABLE, sentence="")
-    unseen, both = known_near(unseen=0.9), known_near(unseen=0.9, unseen_path=0.01)
-    assert word_of(verdict_of("replay", [lacking]), unseen, 0.02).only == "unseen"
-    assert word_of(verdict_of("replay", [lacking, lacking]), unseen, 0.02).only == ""
-    assert word_of(verdict_of("replay", [lacking, lacking]), both, 0.02).only == ""
-    assert word_of(verdict_of("replay", [lacking]), known_near(), 0.02).only == ""
+@pytest.mark.parametrize(
+    ("num_lacking", "changes", "only"),
+    [
+        (1, {"unseen": 0.9}, "unseen"),
+        (2, {"unseen": 0.9}, ""),
+        (2, {"unseen": 0.9, "unseen_path": 0.01}, ""),
+        (1, {}, ""),
+    ],
+)
+def test_a_run_names_the_one_limit_without_which_it_is_safe(
+    num_lacking: int, changes: dict[str, float], only: str
+) -> None:
+    verdict = verdict_of("replay", [Reason(outcome=Outcome.NOT_EVALUABLE, sentence="")] * num_lacking)
+    assert word_of(verdict, known_near(**changes), 0.02).only == only
 
 
-def test_seeds_below_a_hundred_keep_their_families() -> None:
+@pytest.mark.parametrize(
+    ("seed", "families"),
+    [
+        (99, {13: "people", 14: "benign", 15: "benign"}),
+        (100, {13: "people", 14: "behind", 18: "benign", 19: "benign"}),
+        (499, {17: "settings", 18: "benign", 19: "benign"}),
+        (500, {17: "settings", 18: "frozen", 24: "still", 25: "benign", 26: "benign"}),
+    ],
+)
+def test_seeds_below_a_hundred_keep_their_families(seed: int, families: dict[int, str]) -> None:
     """Rows of campaigns are drawn again by seed and index."""
-    assert [family_of(99, index) for index in (13, 14, 15)] == ["people", "benign", "benign"]
-    assert [family_of(100, index) for index in (13, 14, 18, 19)] == ["people", "behind", "benign", "benign"]
-    assert [family_of(499, index) for index in (17, 18, 19)] == ["settings", "benign", "benign"]
-    assert [family_of(500, index) for index in (17, 18, 24, 25, 26)] == [
-        *("settings", "frozen", "still", "benign", "benign")
-    ]
+    assert {index: family_of(seed, index) for index in families} == families
 
 
 def test_settings_that_a_run_draws_are_those_of_its_configuration(model: RobotModel) -> None:
-    trial = draw(100, next(i for i in range(40) if family_of(100, i) == "settings"), model)
-    config = config_of(trial)
+    trial = drawn(model, "settings", 100)
     assert trial.draft.settings
     for key, value in trial.draft.settings:
-        section, _, name = key.partition(".")
-        assert getattr(getattr(config, section), name) == pytest.approx(value, abs=0.5)
-        assert getattr(getattr(config, section), name) != getattr(getattr(Config(), section), name)
+        chosen, default = attrgetter(key)(config_of(trial)), attrgetter(key)(Config())
+        assert chosen == pytest.approx(value, abs=0.5) and chosen != default
 
 
 def test_a_camera_on_the_hand_rides_with_it_and_sees_nothing_nearer_than_it_can(
     model: RobotModel, tmp_path: Path
 ) -> None:
-    trial = draw(100, next(i for i in range(60) if family_of(100, i) == "wrist"), model)
+    trial = drawn(model, "wrist", 100)
     record(trial, model, tmp_path)
-    records = open_source(tmp_path / "log.mcap").records()
-    frames = [r for r in records if isinstance(r, RgbdFrame) and r.camera == "wrist"]
+    frames = [frame for frame in read(tmp_path)[1] if frame.camera == "wrist"]
     assert len(frames) == NUM_FRAMES
     for frame in frames:
         hand = model.frame_pose(trial.world.positions(np.array([frame.stamp_ns]))[0], "hand")
@@ -449,18 +463,16 @@ def test_a_fault_or_target_is_observable_where_images_show_it(
     world: dict[str, Any],
     edits: list[tuple[Edit, tuple[bool, str]]],
 ) -> None:
-    """A target narrower than half a pixel is disclaimed; where no rule is given, it is not judged."""
+    """A target narrower than half a pixel is disclaimed; where no rule is given, it is not judged.
+
+    The draft of a dark target names no fault.
+    """
     made = world_of(ball(np.array([0.55, 0.1, 0.05]), world.get("radius", 0.05)))
     made = replace(made, cameras=made.cameras[: world.get("num_cameras", 3)], body=world.get("body", Body()))
     shown = shown_of(made, fault, model, tmp_path) if world else recorded(fault)[0]
     for edit, expected in edits:
-        holds, rule = judged(draft_of(drawn_as(fault)), made, edit(shown), model)
+        holds, rule = judged(draft_of(Fault() if fault == DARK else fault), made, edit(shown), model)
         assert (holds, rule if expected[1] else "") == expected
-
-
-def drawn_as(fault: Fault) -> Fault:
-    """The fault that a draft names: a dark target is none."""
-    return Fault() if fault == DARK else fault
 
 
 def test_a_target_between_two_frame_sets_is_not_observable(model: RobotModel, tmp_path: Path) -> None:

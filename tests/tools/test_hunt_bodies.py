@@ -13,11 +13,11 @@ from splatctrl_cli.simulate.arm import UNMODELLED, Block, Capsule, link_shape
 from splatctrl_cli.simulate.primitives import Primitive, signed_distance
 from splatctrl_cli.simulate.render import StereoDepth
 from splatctrl_cli.simulate.tabletop import arm_solids
-from tests.tools.test_hunt import START, ball, in_view, read, shown_of, world_of
+from tests.tools.test_hunt import START, beside, clearance_at_start, in_view, read, shown_of, world_of
 from tools.hunt.body import Body, draw_body
 from tools.hunt.clearance import TrueArm
 from tools.hunt.faults import Fault
-from tools.hunt.trial import draw, record, true_robot
+from tools.hunt.trial import draw, record
 from tools.hunt.world import at_s, draw_cameras
 
 EXACT = StereoDepth(spread=0.0, fattening=(0.0, 0.0), dropout=0.0, width=640)
@@ -29,27 +29,18 @@ def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tools.hunt.recording.NUM_FRAMES", 2)
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
-    return true_robot(tmp_path_factory.mktemp("robot"))
-
-
-def test_the_clearance_is_that_of_what_is_seen_of_the_arm(model: RobotModel) -> None:
-    T = model.frame_pose(START, "hand")
-    place = (T @ [0.025 + 0.05 + 0.004, 0.0, 0.033, 1.0])[:3]  # 4 mm beside the collision shape of the palm
-    at = np.array([at_s(0)])
-    for body, expected in ((Body(), 0.004), (Body(is_slim=True), 0.007)):
-        assert abs(TrueArm(model, body=body).clearances([ball(place)], at, START[None])[0] - expected) < 1e-6
+@pytest.mark.parametrize(("body", "clearance"), [(Body(), 0.004), (Body(is_slim=True), 0.007)])
+def test_the_clearance_is_that_of_what_is_seen_of_the_arm(model: RobotModel, body: Body, clearance: float) -> None:
+    target = beside(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm beside the collision shape of the palm
+    assert abs(clearance_at_start(TrueArm(model, body=body), target) - clearance) < 1e-6
 
 
 @pytest.mark.parametrize("name", UNMODELLED)
 def test_an_unmodelled_part_counts(model: RobotModel, name: str) -> None:
     link, capsules = UNMODELLED[name]
-    end = (model.frame_pose(START, link) @ [*capsules[0].end, 1.0])[:3]
-    at, body = np.array([at_s(0)]), Body(is_slim=True, parts=(name,))
-    found = TrueArm(model, body=body).clearances([ball(end, 0.001)], at, START[None])[0]
-    assert found == pytest.approx(-0.001 - capsules[0].radius, abs=1e-6)
-    assert TrueArm(model, body=Body(is_slim=True)).clearances([ball(end, 0.001)], at, START[None])[0] > 0
+    arms = (TrueArm(model, body=Body(is_slim=True, parts=parts)) for parts in ((name,), ()))
+    found, without = (clearance_at_start(arm, beside(model, link, *capsules[0].end, radius=0.001)) for arm in arms)
+    assert found == pytest.approx(-0.001 - capsules[0].radius, abs=1e-6) and without > 0
 
 
 def test_runs_of_seeds_below_two_hundred_keep_the_arm_and_the_depth_of_before() -> None:

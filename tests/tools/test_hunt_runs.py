@@ -24,19 +24,26 @@ def row(**changes: object) -> Row:
     return Row(**(values | changes))  # type: ignore[arg-type]
 
 
-def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin() -> None:
-    assert row(clearance=-0.001).is_false_green
-    assert row(clearance=0.014).is_false_green
-    assert not row(clearance=0.016).is_false_green
-    assert not row(clearance=-0.001, outcome="contact").is_false_green
-    assert not row(clearance=-0.001, outcome="not evaluable").is_false_green
+@pytest.mark.parametrize(
+    ("clearance", "outcome", "is_false_green"),
+    [
+        (-0.001, "safe", True),
+        (0.014, "safe", True),
+        (0.016, "safe", False),
+        (-0.001, "contact", False),
+        (-0.001, "not evaluable", False),
+    ],
+)
+def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin(
+    clearance: float, outcome: str, is_false_green: bool
+) -> None:
+    assert row(clearance=clearance, outcome=outcome).is_false_green == is_false_green
 
 
 def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
     rows = [row(), row(index=2, outcome="contact", reason="a, b", clearance=-0.0125, observable=False)]
-    merge_rows(tmp_path / "t.csv", rows[:1])
-    merge_rows(tmp_path / "t.csv", rows[1:])
-    merge_rows(tmp_path / "t.csv", rows)
+    for more in (rows[:1], rows[1:], rows):
+        merge_rows(tmp_path / "t.csv", more)
     assert read_rows(tmp_path / "t.csv") == rows
 
 
@@ -51,16 +58,13 @@ def test_rows_of_a_table_from_before_stereo_depth_still_load(tmp_path: Path) -> 
 
 
 def test_the_upper_limit_of_no_failure_in_two_thousand_is_fifteen_in_ten_thousand() -> None:
-    assert abs(upper_limit(0, 2000) - 0.0015) < 1e-5
-    assert upper_limit(5, 5) == 1.0
+    assert (upper_limit(0, 2000), upper_limit(5, 5)) == (pytest.approx(0.0015, abs=1e-5), 1.0)
 
 
 def test_the_report_names_false_greens_and_counts_the_benign() -> None:
     rows = [row(), row(index=2, clearance=-0.01), row(index=3, outcome="contact", reason="clearance 0.001 m")]
-    text = "\n".join(report(rows))
-    assert "false green, contact, observable: 1 of 3 runs" in text
-    assert "0/2 benign" in text
-    assert "1 of 2 safe (50.0 %)" in text
+    for words in ("false green, contact, observable: 1 of 3 runs", "0/2 benign", "1 of 2 safe (50.0 %)"):
+        assert words in "\n".join(report(rows))
 
 
 def test_the_report_says_what_each_limit_alone_catches_and_costs() -> None:
@@ -111,13 +115,10 @@ def test_the_truth_of_a_run_with_stereo_depth_is_that_of_what_is_seen(tmp_path: 
     model = true_robot(tmp_path)
     chosen = (index for index in range(60) if draw_body(STEREO_SEED, index, family_of(STEREO_SEED, index)).parts)
     trial = next(t for t in (draw(STEREO_SEED, index, model) for index in chosen) if t.mode == "audit")
-    found = run(STEREO_SEED, trial.index)
-    world = trial.world
-    assert found.robot == f"slim {world.body.parts[0]}"
-    assert found.spread > 0
+    found, world = run(STEREO_SEED, trial.index), trial.world
     arms = (TrueArm(model, world.tool, body) for body in (world.body, Body()))
     seen, collides = (
         least_clearance(arm, world.primitives, world.positions, at_s(0), at_s(DURATION_S))[0] for arm in arms
     )
-    assert found.clearance == pytest.approx(seen, abs=TOLERANCE)
-    assert seen != pytest.approx(collides, abs=1e-3)
+    assert (found.robot, found.clearance) == (f"slim {world.body.parts[0]}", pytest.approx(seen, abs=TOLERANCE))
+    assert found.spread > 0 and seen != pytest.approx(collides, abs=1e-3)

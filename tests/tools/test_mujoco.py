@@ -1,4 +1,6 @@
-"""Recordings made by MuJoCo: their truth, their images, what their sensors measure, and the logs that they write."""
+"""Recordings made by MuJoCo: their truth, their images, what their sensors measure, and the logs that they write; and
+the same scene, robot and sensor in both simulators, which give the same depth, clearance and statistics.
+"""
 
 import ast
 import hashlib
@@ -8,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,12 +20,18 @@ mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip inst
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from splatctrl_cli.cli.main import main  # noqa: E402
+from splatctrl_cli.records import Intrinsics, SphereSet  # noqa: E402
+from splatctrl_cli.robot.model import RobotModel  # noqa: E402
+from splatctrl_cli.simulate import render, tabletop  # noqa: E402
+from splatctrl_cli.simulate.primitives import Primitive  # noqa: E402
+from splatctrl_cli.simulate.render import StereoDepth  # noqa: E402
+from splatctrl_cli.simulate.truth import distance_to  # noqa: E402
 from tools.mujoco import recording  # noqa: E402
 from tools.mujoco.cell import Cell, Lens, as_piece  # noqa: E402
 from tools.mujoco.depth import COUNT, DEPTH_LENS, Laser, Stereo, aligned  # noqa: E402
 from tools.mujoco.images import Camera, Studio, views_of  # noqa: E402
 from tools.mujoco.poses import Float64, inverse, look_at, moved, pose, turn_rpy  # noqa: E402
-from tools.mujoco.robots import ROBOTS, load_robot  # noqa: E402
+from tools.mujoco.robots import ROBOTS, Piece, load_robot  # noqa: E402
 from tools.mujoco.solids import Solid, Track, fixed, frusta, signed_distance  # noqa: E402
 from tools.mujoco.stage import bottle, room  # noqa: E402
 from tools.mujoco.topics import FORMATS, log_name, opened_log  # noqa: E402
@@ -30,6 +39,7 @@ from tools.mujoco.truth import Body, World, clearance_of, load_world, mujoco_dif
 
 PACKAGE = Path(recording.__file__).parent
 LENS = Lens(fx=610.0, fy=612.0, cx=322.5, cy=236.0)
+NONE = np.zeros((480, 640), dtype=bool)
 SOLIDS = (
     Solid(name="box", kind="box", size=(0.1, 0.05, 0.2), track=fixed(np.eye(4))),
     Solid(name="cylinder", kind="cylinder", size=(0.08, 0.2), track=fixed(np.eye(4))),
@@ -49,6 +59,14 @@ def renderer() -> Iterator[None]:
     yield
 
 
+def points_on(triangles: Float64, num: int, rng: np.random.Generator) -> Float64:
+    """Points (num, 3) on triangles (N, 3, 3), by area."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    chosen = rng.choice(len(triangles), num, p=area / area.sum())
+    return np.asarray(np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), num), triangles[chosen]))
+
+
 def test_nothing_of_the_judge_imports_the_tool() -> None:
     for path in PACKAGE.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -61,17 +79,12 @@ def test_nothing_of_the_judge_imports_the_tool() -> None:
 def test_a_distance_is_that_of_the_nearest_of_many_surface_points(solid: Solid) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.35, 0.35, (25, 3))
-    triangles = as_piece(solid).triangles
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    chosen = rng.choice(len(triangles), 200_000, p=area / area.sum())
-    surface = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), triangles[chosen])
+    surface = points_on(as_piece(solid).triangles, 200_000, rng)
     nearest = np.array([np.linalg.norm(surface - point, axis=1).min() for point in points])
     distance, slope = signed_distance(solid, points)
     np.testing.assert_allclose(np.abs(distance), nearest, atol=2e-3)
-    step = 1e-6
-    for axis in range(3):
-        shift = step * np.eye(3)[axis]
-        change = (signed_distance(solid, points + shift)[0] - signed_distance(solid, points - shift)[0]) / (2 * step)
+    for axis, shift in enumerate(1e-6 * np.eye(3)):
+        change = (signed_distance(solid, points + shift)[0] - signed_distance(solid, points - shift)[0]) / 2e-6
         assert np.median(np.abs(change - slope[:, axis])) < 1e-6
 
 
@@ -94,7 +107,9 @@ def test_clearance_agrees_with_a_dense_sample_and_with_mujoco(name: str) -> None
     seen, _ = world.clearances(np.zeros(1), q)
     poses = Cell(robot, (), ()).link_poses(q)
     for column, solid in enumerate(solids):
-        points = np.concatenate([moved(poses[link][0], _sampled(body, rng)) for link, body in world.seen().items()])
+        points = np.concatenate(
+            [moved(poses[link][0], points_on(body.triangles, 12_000, rng)) for link, body in world.seen().items()]
+        )
         near = signed_distance(solid, moved(inverse(solid.track.poses[0]), points))[0].min()
         assert -1e-4 <= min(near, 0.3) - seen.per[0, column] < 2.5e-3, (solid.name, near, seen.per[0, column])
     assert mujoco_difference(world, 0.0, q[0]) < 2e-4
@@ -118,23 +133,21 @@ def test_what_moves_with_the_robot_is_robot_and_not_an_obstacle() -> None:
     assert during == pytest.approx(0.06, abs=1e-3)
 
 
-def test_the_truth_is_that_of_the_recordings_that_others_made(real_data: Path) -> None:
-    for name, model in (
-        ("panda_shelf_real", "panda"),
-        ("ur5_near60_ideal", "ur5"),
-        ("panda_near60_ideal", "panda_tight"),
-    ):
-        folder = real_data / "mujoco" / name
-        with np.load(folder / "truth.npz") as known:
-            solids = [
-                _theirs(entry, known["t_pose"], known[f"pose_{entry['name']}"])
-                for entry in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["objects"]
-                if entry["kind"] != "mesh"
-            ]
-            rows = slice(0, None, 20)
-            world = World(robot=load_robot(model), solids=tuple(solids))
-            ours = world.clearances(known["t"][rows], known["q"][rows])[0].least
-            assert np.abs(ours - np.minimum(known["visual"][rows], 0.3)).max() < 5e-4
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [("panda_shelf_real", "panda"), ("ur5_near60_ideal", "ur5"), ("panda_near60_ideal", "panda_tight")],
+)
+def test_the_truth_is_that_of_the_recordings_that_others_made(real_data: Path, name: str, model: str) -> None:
+    folder = real_data / "mujoco" / name
+    with np.load(folder / "truth.npz") as known:
+        solids = [
+            _theirs(entry, known["t_pose"], known[f"pose_{entry['name']}"])
+            for entry in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["objects"]
+            if entry["kind"] != "mesh"
+        ]
+        t, q, visual = (known[column][::20] for column in ("t", "q", "visual"))
+    ours = World(robot=load_robot(model), solids=tuple(solids)).clearances(t, q)[0].least
+    assert np.abs(ours - np.minimum(visual, 0.3)).max() < 5e-4
 
 
 def test_exact_depth_lies_on_the_true_surfaces(renderer: None) -> None:
@@ -148,32 +161,30 @@ def test_exact_depth_lies_on_the_true_surfaces(renderer: None) -> None:
     image = studio.image(camera, [0])
     is_robot = studio.is_robot(camera)
     studio.close()
-    v, u = np.nonzero((image.depth > 0) & ~is_robot)
-    z = image.depth[v, u] * COUNT
-    points = moved(
-        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
-    )
+
+    def seen(which: np.ndarray) -> Float64:
+        """Points [m] of pixels with depth."""
+        v, u = np.nonzero((image.depth > 0) & which)
+        z = image.depth[v, u] * COUNT
+        rays = np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
+        return moved(camera.T_parent_camera, rays)
+
+    points = seen(~is_robot)
     away = np.min([np.abs(signed_distance(s, moved(inverse(s.track.poses[0]), points))[0]) for s in solids], axis=0)
     assert len(points) > 200_000
     assert np.quantile(away, 0.95) < 5e-4
-    v, u = np.nonzero((image.depth > 0) & is_robot)
-    z = image.depth[v, u] * COUNT
-    points = moved(
-        camera.T_parent_camera, np.stack([(u - LENS.cx) / LENS.fx * z, (v - LENS.cy) / LENS.fy * z, z], axis=1)
-    )
+    points = seen(is_robot)
     pieces = {link: Body.of(found) for link, found in robot.visual.items() if found}
     poses = cell.link_poses(q[None])
-    chosen = points[:: len(points) // 60]
-    for point in chosen:
+    for point in points[:: len(points) // 60]:
         ball = Solid(name="point", kind="ball", size=(0.0,), track=fixed(pose(point)))
         assert clearance_of(pieces, poses, [ball], np.zeros(1)).least[0] < 6e-4
 
 
 def test_stereo_errs_as_its_figures_say() -> None:
     sensor, rng = Stereo(spread=0.07, fattening=2, dropouts=0.0), np.random.default_rng(0)
-    none = np.zeros((480, 640), dtype=bool)
     for distance, expected in ((0.5, 0.9e-3), (1.0, 3.63e-3), (2.0, 14.5e-3)):
-        z = sensor.measured(np.full((480, 640), distance), none, rng)
+        z = sensor.measured(np.full((480, 640), distance), NONE, rng)
         assert np.std(z) == pytest.approx(expected, rel=0.12)  # z^2 spread / (f b)
         disparity = DEPTH_LENS.fx * sensor.baseline / z
         np.testing.assert_allclose(disparity * 32, np.rint(disparity * 32), atol=1e-6)
@@ -185,9 +196,7 @@ def test_stereo_errs_as_its_figures_say() -> None:
 def test_stereo_fattens_a_foreground_and_loses_what_the_right_imager_does_not_see() -> None:
     exact = np.full((480, 640), 2.0)
     exact[160:320, 200:400] = 1.0
-    z = Stereo(spread=0.0, fattening=3, dropouts=0.0).measured(
-        exact, np.zeros(exact.shape, bool), np.random.default_rng(0)
-    )
+    z = Stereo(spread=0.0, fattening=3, dropouts=0.0).measured(exact, NONE, np.random.default_rng(0))
     is_near = np.abs(z - 1.0) < 0.03
     widths = is_near[200:280].sum(axis=1)
     assert widths.min() >= 202 and widths.max() <= 206 and len(set(widths)) > 1
@@ -200,7 +209,7 @@ def test_stereo_fattens_a_foreground_and_loses_what_the_right_imager_does_not_se
 def test_a_laser_mixes_depths_at_an_edge() -> None:
     exact = np.full((480, 640), 2.0)
     exact[:, 320:] = 1.0
-    z = Laser(dropouts=0.0).measured(exact, np.zeros(exact.shape, bool), np.random.default_rng(0))
+    z = Laser(dropouts=0.0).measured(exact, NONE, np.random.default_rng(0))
     assert np.std(z[:, 400:]) == pytest.approx(2.5e-3, rel=0.03)
     between = (z > 1.05) & (z < 1.95)
     assert not between[:, :318].any() and not between[:, 322:].any()
@@ -208,8 +217,7 @@ def test_a_laser_mixes_depths_at_an_edge() -> None:
 
 
 def test_aligned_depth_of_a_plane_is_the_plane() -> None:
-    depth = np.full((480, 640), 1.2)
-    assert set(np.unique(aligned(depth, LENS))) == {1200}
+    assert set(np.unique(aligned(np.full((480, 640), 1.2), LENS))) == {1200}
     square = np.zeros((480, 640))
     square[230:250, 310:330] = 1.0
     v, u = np.nonzero(aligned(square, LENS))
@@ -258,14 +266,6 @@ def test_a_recording_is_whole_and_the_same_twice(
     assert all(camera in shown for camera in said["cams"])
 
 
-def _sampled(body: Body, rng: np.random.Generator) -> Float64:
-    """Points on triangles, by area."""
-    a, b, c = np.moveaxis(body.triangles, 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(a), 12_000, p=area / area.sum())
-    return np.asarray(np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), body.triangles[chosen]))
-
-
 def _theirs(entry: dict[str, object], times: Float64, rows: Float64) -> Solid:
     """A solid of the recordings that others made."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -273,3 +273,79 @@ def _theirs(entry: dict[str, object], times: Float64, rows: Float64) -> Solid:
     kind = str(entry["kind"]).replace("sphere", "ball")
     size = tuple(float(value) for value in np.asarray(entry["size"]))
     return Solid(name=str(entry["name"]), kind=kind, size=size, track=Track(times=times, poses=poses))
+
+
+def as_solid(primitive: Primitive) -> Solid:
+    """One of our simulator's primitives as a solid of the other's."""
+    halves = {"box": [0.5, 0.5, 0.5], "cylinder": [1.0, 0.5], "sphere": [1.0]}
+    size = np.array(primitive.size) * halves[primitive.kind]
+    kind = primitive.kind.replace("sphere", "ball")
+    return Solid(name=primitive.name, kind=kind, size=tuple(size.tolist()), track=fixed(primitive.T_world_shape))
+
+
+def test_the_same_scene_has_the_same_depth_in_both(renderer: None) -> None:
+    primitives = [*tabletop.furniture(), *tabletop.objects()]
+    T = look_at((1.15, -0.15, 0.95), (0.36, 0.0, 0.10))
+    lens = Intrinsics(fx=LENS.fx, fy=LENS.fy, cx=LENS.cx, cy=LENS.cy, width=640, height=480)
+    ours = render.Camera(name="camera", intrinsics=lens, T_world_camera=T, is_training=True)
+    mine = render.Renderer(ours, primitives, color_rays=0).depth([])
+    camera = Camera(name="camera", lens=LENS, T_parent_camera=T)
+    cell = Cell(load_robot("panda"), [as_solid(p) for p in primitives], views_of([camera]))
+    cell.place(np.array([2.5, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]), 0.0)
+    studio = Studio(cell, [camera], None)
+    theirs, is_robot = studio.exact_depth("camera"), studio.is_robot(camera)
+    studio.close()
+    step = cv2.dilate(mine, np.ones((5, 5), np.uint8)) - cv2.erode(mine, np.ones((5, 5), np.uint8))
+    flat = (step < 0.03) & (mine > 0) & ~cv2.dilate(is_robot.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    assert flat.mean() > 0.6
+    difference = np.abs(mine - theirs)[flat]
+    assert np.quantile(difference, 0.95) < 1e-4
+    assert np.quantile(difference, 0.9999) < 1e-3
+
+
+def test_the_same_spheres_on_the_same_robot_have_the_same_clearance_in_both() -> None:
+    robot, rng = load_robot("ur5"), np.random.default_rng(0)
+    links = [joint.child for joint in robot.driven for _ in range(3)]
+    centers, radii = rng.uniform(-0.1, 0.1, (len(links), 3)), rng.uniform(0.02, 0.06, len(links))
+    names = [joint.name for joint in robot.driven]
+    model = RobotModel.from_urdf(robot.urdf, SphereSet(links=tuple(links), centers=centers, radii=radii))
+    assert [*model.joint_names] == names
+    q = rng.uniform(robot.description.low, robot.description.high, (12, 6))
+    primitives = tabletop.objects()
+    expected = [distance_to(primitives, model.sphere_centers(row), 0) - radii for row in q]
+    balls: dict[str, list[Piece]] = {}
+    for link, center, radius in zip(links, centers, radii, strict=True):
+        piece = as_piece(Solid(name="ball", kind="ball", size=(radius,), track=fixed(np.eye(4))))
+        balls.setdefault(link, []).append(replace(piece, vertices=moved(pose(center), piece.vertices)))
+    bodies = {link: Body.of(pieces) for link, pieces in balls.items()}
+    poses = Cell(robot, (), ()).link_poses(q)
+    found = clearance_of(bodies, poses, [as_solid(p) for p in primitives], np.zeros(len(q))).least
+    near = np.min(expected, axis=1)
+    assert (near < 0.3).sum() > 5
+    np.testing.assert_allclose(found, np.minimum(near, 0.3), atol=3e-4)
+
+
+def test_the_same_stereo_camera_has_the_same_statistics_in_both() -> None:
+    ours = StereoDepth(spread=0.06, window=4.0, fattening=(1.0, 3.0), dropout=0.004)
+    theirs = Stereo(spread=0.06, window=2.0, fattening=3, dropouts=0.004)
+    for distance in (0.5, 1.0, 2.0):
+        images = _both(np.full((480, 640), distance), ours, theirs)
+        spread = [float(np.std(z[z > 0])) for z in images]
+        assert spread[0] == pytest.approx(spread[1], rel=0.08)
+        assert [(z == 0).mean() for z in images] == pytest.approx([0.004, 0.004], abs=5e-4)
+        assert len({tuple(np.unique(DEPTH_LENS.fx * 0.05 * 32 / z[z > 0]).round(3)[:1]) for z in images}) <= 2
+    box = np.full((480, 640), 2.0)
+    box[160:320, 200:400] = 1.0
+    grown, lost = [], []
+    for z in _both(box, replace(ours, dropout=0.0, spread=0.0), replace(theirs, dropouts=0.0, spread=0.0)):
+        grown.append(float((np.abs(z[180:300] - 1.0) < 0.05).sum(axis=1).mean() - 200) / 2)
+        lost.append(float((z[180:300, 180:200] == 0).sum(axis=1).mean()))
+        assert (z[180:300, 403:] > 1.9).all()
+    assert grown == pytest.approx([2.0, 2.0], abs=0.35)  # one to three pixels on either side
+    assert lost[0] == pytest.approx(lost[1], abs=0.7)
+
+
+def _both(exact: Float64, ours: StereoDepth, theirs: Stereo) -> tuple[Float64, Float64]:
+    """Depth [m] that both stereo models measure, from exact depth [m]."""
+    first = ours.applied(exact.astype(np.float32), np.random.default_rng(0), focal=DEPTH_LENS.fx)
+    return first.astype(np.float64), theirs.measured(exact, NONE, np.random.default_rng(0))

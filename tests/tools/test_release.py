@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import splatctrl_cli
+from tests.robot.shapes import written
 from tools import release
 
 
@@ -29,10 +30,7 @@ def test_versions_that_differ_end_the_release(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_a_bare_environment_holds_no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    programs = tmp_path / "bare" / "bin"
-    programs.mkdir(parents=True)
-    (programs / "cmake").write_text("")
-    (programs / "cmake").chmod(0o755)
+    written(tmp_path, "", "bare/bin/cmake").chmod(0o755)
     monkeypatch.setattr(release, "DIST", tmp_path)
     monkeypatch.setattr(release, "_run", lambda *words: None)
     with pytest.raises(SystemExit, match="expected no compiler, got cmake"):
