@@ -8,19 +8,23 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.jobs.replay.metrics import metric_scales
-from splatctrl_cli.records import JointState
+from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, scene_of, splats_of, write_scene
 
 MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-@pytest.fixture
-def moving(desk: Desk) -> None:
+def log_motion(desk: Desk, move: Float64 = MOVE) -> None:
     """A log of one second from START, with its velocity."""
     desk.source.states = [
-        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=MOVE) for s in logged(START + MOVE)
+        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move)
     ]
+
+
+@pytest.fixture
+def moving(desk: Desk) -> None:
+    log_motion(desk)
 
 
 def ball_ahead(arm: RobotModel, gap: float) -> tuple[tuple[float, float, float], float]:

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.replay.request import ReplayRequest
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, Desk, splats_of, write_scene
-from tests.cli.test_replay_modes import ball_ahead, events, moving
+from tests.cli.test_replay_modes import ball_ahead, events, log_motion
 from tests.jobs.stage import MOVE, QUARTER, Beside, Stage, decisive, passing
 from tests.refused import expect_refusal
 from tests.robot.test_fingers import ARM, FRANKA, robot
@@ -77,7 +77,7 @@ def alike(a: str, b: str) -> bool:
 @pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
 def test_the_recorded_commands_of_ours_make_the_same_steps(stage: Stage, mode: str) -> None:
     desk = stage.desk
-    moving(desk)
+    log_motion(desk)
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL, ball_ahead(stage.arm, 0.01))))
     run = ("--scene", str(scene), "-q", "--mode", mode, "--set", "control.max_time=2")
     assert desk.replay(*run, out="ours") == 0
@@ -190,7 +190,7 @@ def test_the_examples_drive_alike(stage: Stage) -> None:
     program, source = stage.desk.folder / "reach", EXAMPLES / "reach.cpp"
     subprocess.run([compiler, "-std=c++17", "-Wall", "-Wextra", "-Werror", "-o", program, source], check=True)
     shutil.copy(EXAMPLES / "reach.py", stage.desk.folder)
-    moving(stage.desk, 0.4 * MOVE)
+    log_motion(stage.desk, 0.4 * MOVE)
     stage.states = stage.desk.source.states
     stage.balls = [*stage.balls, Beside(0.03)]
     scene = stage.scene()
