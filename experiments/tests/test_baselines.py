@@ -15,7 +15,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, scene_of, splats_of, write_field, write_scene
-from tests.cli.test_replay_modes import ball_ahead, moving
+from tests.cli.test_replay_modes import ball_ahead, log_motion
 from tests.jobs.stage import FAR, MOVE, Ball, Stage
 
 SHORT = ("--set", "control.max_time=4")
@@ -36,7 +36,7 @@ def asked(desk: Desk, *words: str, out: str = "out") -> int:
 
 @pytest.mark.usefixtures("painted")
 def test_every_method_has_every_figure(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    moving(desk)
+    log_motion(desk)
     metrics = compared(desk, *scene_of(desk, BALL))
     methods, planned = ("closed_loop", "log", "birrt", "birrt_ik"), ("birrt", "birrt_ik")
     names = {f"{method}_{name}" for method in methods for name in MOTION}
@@ -66,7 +66,7 @@ def in_the_way(arm: RobotModel, q: Float64 = START + MOVE / 2) -> Ball:
 
 
 def test_a_ball_that_comes_later_is_not_planned_for_but_is_measured(desk: Desk, arm: RobotModel) -> None:
-    moving(desk)
+    log_motion(desk)
     later = splats_of(BALL, in_the_way(arm, START + MOVE))
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), (3 * SECOND // 10, later), (SECOND, later))
     metrics = compared(desk, "--scene", str(scene), "--methods", "birrt", *BRIEF)
@@ -78,7 +78,7 @@ def test_a_ball_that_comes_later_is_not_planned_for_but_is_measured(desk: Desk, 
 def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    moving(desk)
+    log_motion(desk)
     metrics = compared(desk, *scene_of(desk, ball_ahead(arm, -0.02)), "--methods", "birrt", *BRIEF)
     assert metrics["birrt_success"] == 0 and metrics["birrt_min_clearance"] is None
     assert "birrt: no path: goal-in-collision" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
 
 @pytest.mark.parametrize("is_grid", [False, True])
 def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: RobotModel, is_grid: bool) -> None:
-    moving(desk)
+    log_motion(desk)
     ball = in_the_way(arm)
     field = ("--field", str(write_field(desk.folder / "field", ball, voxel=0.02))) if is_grid else ()
     metrics = compared(desk, *(field or scene_of(desk, ball)), "--methods", "birrt", *BRIEF)
@@ -106,7 +106,7 @@ def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: Ro
 def test_the_standstill_waits_where_the_controller_goes_on(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    moving(desk)
+    log_motion(desk)
     scene = write_passing_person(desk, arm)
     metrics = compared(desk, "--scene", str(scene), "--methods", "standstill,birrt", "--zone", "0.9,1.0")
     assert metrics["standstill_completed"] == metrics["closed_loop_completed"] == 1
