@@ -142,11 +142,8 @@ class Adjustment:
             if len(rows.residual):
                 deviation, width = np.abs(rows.residual) / rows.sigma, np.minimum(reach / rows.sigma, cut)
                 weight = np.where(deviation < width, np.square(1 - np.square(deviation / width)), 0.0)
-                yield rows, (rows.jacobian / rows.sigma[:, None]) @ self._is_column(rows.columns), weight
-
-    def _is_column(self, columns: Index) -> Float64:
-        """1 where an entry of columns (17,), if free, is an unknown's: (17, P)."""
-        return np.asarray(columns[:, None] == np.arange(self.unknowns.size), np.float64)
+                is_column = rows.columns[:, None] == np.arange(self.unknowns.size)
+                yield rows, rows.jacobian / rows.sigma[:, None] @ is_column, weight
 
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
         """Misfit, and the number of points that can be compared.

@@ -1,8 +1,11 @@
 """The least squares of a calibration, against finite differences and plain NumPy."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
+from splatctrl_cli.calibration.adjustment import Adjustment, Rows
 from splatctrl_cli.calibration.evidence import FIXED, Estimate, Unknowns, transform_of, twist_between, twist_of
 from splatctrl_cli.calibration.views import DepthView, landed, overlap_rows, still_frame, strided, surface_normals
 from splatctrl_cli.geometry import back_project, look_at
@@ -90,3 +93,44 @@ def test_a_step_moves_what_is_free_and_holds_the_rest() -> None:
 def test_a_twist_gives_back_its_transform() -> None:
     T = look_at([1.0, 0.3, 0.8], [0.2, 0.0, 0.0])
     np.testing.assert_allclose(transform_of(twist_of(T)), T, atol=1e-12)
+
+
+class Given(Adjustment):
+    """Residuals at random, of two views of a camera and of two cameras; the first camera is fixed."""
+
+    def __init__(self) -> None:
+        self.unknowns = Unknowns(cameras=("a", "b"), poses=("b",), scales=("b",), has_clock=True)
+
+    def rows(self, estimate: Estimate, reach: float, *, with_robot: bool = True) -> Iterator[Rows]:
+        rng = np.random.default_rng(3)
+        for between in (("b", "b"), ("a", "b")):
+            yield Rows(
+                between=between,
+                alike="",
+                num_laid=60,
+                residual=rng.normal(size=60) * 0.01,
+                sigma=rng.uniform(0.002, 0.02, 60),
+                jacobian=rng.normal(size=(60, 17)),
+                columns=np.concatenate([*map(self.unknowns.columns, between), [7]]),
+                clusters=rng.integers(0, 5, 60),
+            )
+
+
+def test_normal_equations_are_those_of_the_weighted_residuals() -> None:
+    """Tukey's weights; columns of one unknown add up, and gradients of the clusters to the whole one."""
+    given, reach, cut = Given(), 0.02, 2.0
+    whole = given.normal(Estimate(corrections={}), (reach, cut))
+    H, g = np.zeros((8, 8)), np.zeros(8)
+    for rows in given.rows(Estimate(corrections={}), reach):
+        for r, sigma, by in zip(rows.residual, rows.sigma, rows.jacobian, strict=True):
+            J = np.zeros(8)
+            for column, value in zip(rows.columns, by, strict=True):
+                J[column] += value / sigma if column >= 0 else 0.0
+            share = abs(r) / sigma / min(reach / sigma, cut)
+            weight = (1 - share**2) ** 2 if share < 1 else 0.0
+            H += weight * np.outer(J, J)
+            g += weight * r / sigma * J
+    scores = given.scores(Estimate(corrections={}), (reach, cut))
+    assert scores.shape == (5, 8)
+    for found, expected in ((whole.H, H), (whole.g, g), (scores.sum(axis=0), g)):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
