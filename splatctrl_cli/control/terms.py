@@ -119,8 +119,8 @@ class JointLimits:
     def box(self, q: Float64, last_velocity: Float64 | None = None) -> tuple[Float64, Float64]:
         """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-        Without last_velocity no acceleration counts. One in conflict with velocity and position yields, so that the
-        box is never empty; not from a state that this box led to, unless by_position is stricter.
+        Without last_velocity the acceleration limit does not count. It gives way where it contradicts velocity or
+        position limits, so that the box is never empty. In states that this box led to, only by_position can do that.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period

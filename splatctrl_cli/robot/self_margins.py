@@ -223,8 +223,9 @@ def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None
     """Pairs whose spheres often break `margin` [m], with the margin they keep.
 
     Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
-    lesser of the margin and half their largest gap. The pair keeps the largest sphere gap of the near postures if
-    most others keep more. Else it keeps what nearly all other postures keep; with unknown surfaces, at least 0.
+    lesser of the margin and half their largest gap. The margin kept is the largest sphere gap in near postures, if
+    most other postures have a larger one. Else it is the gap that nearly all others exceed; with unknown surfaces, at
+    least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

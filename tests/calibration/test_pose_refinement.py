@@ -208,7 +208,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     shrink_refinement(monkeypatch)
 
 
-def told(views: Sequence[RgbdFrame]) -> FoundBends:
+def bends_of(views: Sequence[RgbdFrame]) -> FoundBends:
+    """Bends found after poses are refined."""
     return depth_bends(views, refined_poses(views))
 
 
@@ -238,7 +239,7 @@ def test_a_stretch_changes_with_the_offset_as_the_derivative_says() -> None:
 
 
 def test_residuals_change_with_the_offsets_as_the_derivative_says(views: list[RgbdFrame]) -> None:
-    """Where surfaces lie on each other: normals and sigmas are held in a round, and change by little."""
+    """On surfaces that coincide. A round keeps normals and sigmas fixed, so the derivative leaves them out."""
     pair = [gray_view(view, 1.0) for view in views[:2]]
     T = invert_transform(views[1].T_world_camera) @ views[0].T_world_camera
     bends = BentViews(recorded=pair, cameras=[0, 1])
@@ -272,9 +273,9 @@ def test_a_bend_is_found_with_the_poses(views: list[RgbdFrame]) -> None:
 
 @pytest.mark.usefixtures("small")
 def test_a_bend_under_noise_is_found_and_noise_alone_is_none(views: list[RgbdFrame]) -> None:
-    found = told(noisy(bent(views, a_bend(0.02))))
+    found = bends_of(noisy(bent(views, a_bend(0.02))))
     assert error(found.grids["camera"], a_bend(0.02)) < 0.15
-    noise = told(noisy(disturbed(views, 10.0, 0.5)))
+    noise = bends_of(noisy(disturbed(views, 10.0, 0.5)))
     assert not noise.grids
     assert noise.unlike == ("camera",)
 
@@ -284,7 +285,7 @@ def test_a_wrong_focal_length_is_no_bend(views: list[RgbdFrame]) -> None:
     """The halves tell the same, and it holds for one of them alone."""
     wrong = [replace(v, intrinsics=replace(v.intrinsics, fx=1.04 * v.intrinsics.fx, fy=1.04 * v.intrinsics.fy))
              for v in views]  # fmt: skip
-    found = told(wrong)
+    found = bends_of(wrong)
     assert not found.grids
     assert not found.unlike
     assert min(found.gains) < 0 < max(found.gains)
@@ -310,7 +311,7 @@ def drifting(views: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 def test_what_a_bend_does_not_explain_is_no_bend_of_the_camera(
     views: list[RgbdFrame], change: Change, add: Change
 ) -> None:
-    assert not told(add(change(views))).grids
+    assert not bends_of(add(change(views))).grids
 
 
 @pytest.mark.usefixtures("small")
@@ -320,11 +321,11 @@ def test_each_camera_has_its_own_bend_and_an_exact_one_none(
     monkeypatch.setattr(fixed, "BEND_VIEWS", 4)
     of_a, of_b = bent(views[::2], a_bend(-0.02)), bent(views[1::2], a_bend(0.03))
     both = [replace(v, camera="ab"[k]) for pair in zip(of_a, of_b, strict=True) for k, v in enumerate(pair)]
-    found = told(both)
+    found = bends_of(both)
     assert error(found.grids["a"], a_bend(-0.02)) < 0.15
     assert error(found.grids["b"], a_bend(0.03)) < 0.15
     monkeypatch.setattr(fixed, "REFINE_ROWS", 150)  # in smaller images the exact camera is not exact
-    one = told([replace(views[k], camera="a") if view.camera == "a" else view for k, view in enumerate(both)])
+    one = bends_of([replace(views[k], camera="a") if view.camera == "a" else view for k, view in enumerate(both)])
     assert error(one.grids["b"], a_bend(0.03)) < 0.15
     assert one.unlike == ("a",)
 

@@ -56,7 +56,7 @@ def above_note(report: CheckReport) -> list[Finding]:
 
 
 def is_good(report: CheckReport) -> bool:
-    """Nothing is found above a note, and every command can start."""
+    """True without errors and warnings, if every command can start."""
     return not above_note(report) and not any(map(report.obstacles, report.lacks))
 
 

@@ -32,7 +32,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict[str, Any], str]:
-    """What a command returns, its object, and what it says on stderr."""
+    """Exit code, JSON object and stderr of a command."""
     code, printed, said = run(capsys, *arguments, "--json")
     return code, json.loads(printed), said
 

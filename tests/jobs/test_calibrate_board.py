@@ -289,7 +289,7 @@ def test_what_is_not_observed_stays_as_recorded_and_the_rest_is_found(tmp_path: 
         assert np.degrees(np.arccos(off[2, 2])) < 0.3 < np.degrees(np.arccos(recorded[2, 2]))
 
 
-def of_board(text: str) -> dict[str, Any]:
+def board_option(text: str) -> dict[str, Any]:
     return {"board": board_of(text)}
 
 
@@ -299,49 +299,49 @@ TIES_NOTHING: dict[str, tuple[Callable[[], SetUp], bool, dict[str, Any], tuple[s
     "a board shown to one camera after the other": (
         partial(ShownApart, options=replace(OPTIONS, duration_s=2.5, fps=4.0)),
         False,
-        of_board("7x4:0.03"),
+        board_option("7x4:0.03"),
         ("does not tie together: cam0 | cam1, cam2", "at the same moment"),
     ),
     "a board seen from behind": (
         Mirrored,
         False,
-        of_board("7x4:0.03"),
+        board_option("7x4:0.03"),
         ("too few views of the board of 7x4 inner corners: cam2 in 0", "its printed side"),
     ),
     "a board of another size": (
         partial(Shown, options=SLOW),
         False,
-        of_board("8x5:0.03"),
+        board_option("8x5:0.03"),
         ("no board of 8x5 inner corners in 12 frames, but one of 7x4", "--board 7x4:0.03"),
     ),
     "a board that looks the same after half a turn": (
         partial(Shown, board=Board(columns=6, rows=4, square=0.03)),
         False,
-        of_board("6x4:0.03"),
+        board_option("6x4:0.03"),
         ("looks the same after half a turn", "use a ChArUco board"),
     ),
     "a board of larger squares": (
         Shown,
         False,
-        of_board("7x4:0.02"),
+        board_option("7x4:0.02"),
         ("measure about 30 mm by the cameras' depth, expected 20", "--board 7x4:0.030"),
     ),
     "no board": (
         partial(SetUp, 2, SLOW),
         False,
-        of_board("7x4:0.03"),
+        board_option("7x4:0.03"),
         ("no board of 7x4 inner corners", "whole and lit"),
     ),
     "a board seen by one camera only": (
         ShownToOne,
         False,
-        of_board("7x4:0.03"),
+        board_option("7x4:0.03"),
         (r"cam0 in 0, cam2 in 0 frames .*; only cam1 sees it",),
     ),
     "a board that somebody moves beside the robot": (
         partial(Turning, options=replace(MOVING, duration_s=6.0, fps=3.0)),
         True,
-        of_board("7x4:0.03"),
+        board_option("7x4:0.03"),
         (r"tied to no robot: .*does not move with the robot.*; let the gripper hold the board",),
     ),
     "one round thing on a table": (partial(RoundBall, 3), False, {}, ("rotation about the table's normal",)),

@@ -36,7 +36,7 @@ def only(*words: str) -> Callable[[Message], list[Message]]:
 
 
 def restamped(message: Message, offset_ns: int | None) -> Message:
-    """With every header moved, or without a stamp; the time of logging stays."""
+    """Shift every header stamp of a message, or set it to 0; the log time stays."""
     for item in getattr(message[3], "transforms", None) or [message[3]]:
         set_stamp(item, 0 if offset_ns is None else stamp_of(item) + offset_ns)
     return message

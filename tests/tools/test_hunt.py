@@ -62,7 +62,7 @@ def shown_of(world: World, fault: Fault, model: RobotModel, folder: Path) -> Sho
     return Recorder(world, fault, model, (0, 0)).write(folder / "log.mcap")
 
 
-def beside(model: RobotModel, link: str, *offset: float, radius: float = 0.05) -> Primitive:
+def ball_at_link(model: RobotModel, link: str, *offset: float, radius: float = 0.05) -> Primitive:
     """A ball at an offset [m] in the frame of a link."""
     return ball((model.frame_pose(START, link) @ [*offset, 1.0])[:3], radius)
 
@@ -114,7 +114,7 @@ def read(folder: Path) -> tuple[list[JointState], list[RgbdFrame]]:
 def test_the_clearance_of_a_ball_beside_a_link_is_exact(
     model: RobotModel, link: str, offset: tuple[float, ...], clearance: float
 ) -> None:
-    assert abs(clearance_at_start(TrueArm(model), beside(model, link, *offset)) - clearance) < 1e-6
+    assert abs(clearance_at_start(TrueArm(model), ball_at_link(model, link, *offset)) - clearance) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere"])
@@ -138,7 +138,7 @@ def test_the_clearance_is_no_more_than_that_of_any_point_of_the_surface(model: R
 
 
 def test_the_least_clearance_is_found_between_two_samples(model: RobotModel) -> None:
-    near = beside(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm beside the palm, for a moment
+    near = ball_at_link(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm beside the palm, for a moment
     away = 0.4 * model.frame_pose(START, "hand")[:3, 0]
     found, when = least_at_rest(model, moving(near, [0.6, 1.0073, 1.4], np.array([away, 0 * away, away])))  # at 1 m/s
     assert (found, when) == (pytest.approx(0.004, abs=3e-4), pytest.approx(at_s(1.0073), abs=1e6))
@@ -146,7 +146,9 @@ def test_the_least_clearance_is_found_between_two_samples(model: RobotModel) -> 
 
 def test_a_ball_that_passes_a_round_link_is_nearest_between_two_samples(model: RobotModel) -> None:
     side = 0.29 * model.frame_pose(START, "link6")[:3, 2]
-    passing = beside(model, "link6", 0.044, -0.048 - 0.01 - 0.004, 0.0, radius=0.01)  # a capsule of 48 mm along x
+    passing = ball_at_link(
+        model, "link6", 0.044, -0.048 - 0.01 - 0.004, 0.0, radius=0.01
+    )  # a capsule of 48 mm along x
     target = moving(passing, [1.0, 1.58], np.array([-side, side]))  # nearest at 1.29 s
     found, when = least_at_rest(model, target)
     fine = np.arange(at_s(1.28), at_s(1.30), 100_000)
@@ -155,12 +157,12 @@ def test_a_ball_that_passes_a_round_link_is_nearest_between_two_samples(model: R
 
 
 def test_what_is_there_for_a_millisecond_alone_counts(model: RobotModel) -> None:
-    assert least_at_rest(model, during(beside(model, "hand", 0.0, 0.0, 0.0), 1.0007, 1.0017))[0] < 0
+    assert least_at_rest(model, during(ball_at_link(model, "hand", 0.0, 0.0, 0.0), 1.0007, 1.0017))[0] < 0
 
 
 def test_a_tool_that_no_model_has_counts(model: RobotModel) -> None:
     tool = Capsule(start=(0.0, 0.0, 0.08), end=(0.0, 0.0, 0.2), radius=0.02)
-    target = beside(model, "hand", 0.0, 0.0, 0.2 + 0.02 + 0.05 + 0.01)
+    target = ball_at_link(model, "hand", 0.0, 0.0, 0.2 + 0.02 + 0.05 + 0.01)
     assert abs(clearance_at_start(TrueArm(model, tool), target) - 0.01) < 1e-6
     assert clearance_at_start(TrueArm(model), target) > 0.05
 

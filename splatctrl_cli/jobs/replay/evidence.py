@@ -100,14 +100,14 @@ def check_evidence(request: ReplayRequest) -> None:
     scene = open_scene(request.scene)
     refuse_if(
         every is None and request.evidence in scene.cameras,
-        f"{option}: the camera trained {request.scene}",
-        remedy=f"name one that did not: any but {', '.join(scene.cameras)}",
+        f"{option}: {request.scene} was made from its depth",
+        remedy=f"name a held-out camera: any but {', '.join(scene.cameras)}",
         error=UsageError,
     )
     refuse_if(
         every is not None and scene.run.get("metrics", {}).get(EVERY) != every,
-        f"{option}: every frame set of {', '.join(scene.cameras)} trained {request.scene}",
-        remedy="name a camera that did not, or give --lockstep, which leaves these sets out",
+        f"{option}: {request.scene} was made from every frame set of {', '.join(scene.cameras)}",
+        remedy="name a held-out camera, or give --lockstep, which leaves these sets out",
         error=UsageError,
     )
 

@@ -29,7 +29,7 @@ from splatctrl_cli.voxels import EvidenceClass
 LIMITS = (
     Bound(
         quantity="never seen, of all points within the margin",
-        why="correct recordings of three cameras leave up to 49 %; what this limit alone rejects leaves 50 % or more",
+        why="nearly all correct recordings of three cameras leave less",
         on="unseen",
         at_most=UNSEEN,
         say="{percent:.0f} % of the space within the margin of the arm was never seen, allowed {allowed_percent:g} %",
@@ -296,7 +296,7 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="calibration", find=calibration, broken=UNKNOWN),
     Criterion(name="map resolution", find=map_resolution, broken=UNKNOWN),
     Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
-    Criterion(name="known space", find=known_space, broken=UNKNOWN),
+    Criterion(name="known space", find=known_space, broken=f"{UNKNOWN}; failed with `--unseen occupied`"),
     Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
     Criterion(name="map age", find=map_age, broken=f"{UNKNOWN}; *contact* or *margin broken* by its own depth"),
     Criterion(

@@ -145,7 +145,7 @@ def when_and_why(replay: Replay) -> list[str]:
         )
     if replay.closed_loop is not None and replay.start_time_s > 0:
         lines.append(f"times count from the start, at {replay.start_time_s:.2f} s of the log")
-    return lines or ["no event: no state is below the margin, outside its limits or in space that is not known"]
+    return lines or ["no event: at every state, surfaces of the map are outside the margin, and limits hold"]
 
 
 def describe_event(event: Event, *, with_kind: bool = True) -> str:

@@ -62,7 +62,8 @@ def check_goal(request: ReplayRequest) -> None:
         if value is not None and value is not False and request.mode not in wanted:
             name = "--" + option.replace("_", "-")
             raise UsageError(
-                f"{name}: expected --mode {' or '.join(wanted)}, got {request.mode}", remedy=f"leave out {name}"
+                f"{name}: expected --mode {' or '.join(wanted)}, got {request.mode}",
+                remedy=f"give --mode {wanted[-1]}, or leave out {name}",
             )
 
 

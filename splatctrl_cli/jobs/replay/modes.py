@@ -212,9 +212,9 @@ def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
     start = int(stamps[0]) + round(float(request.start_time) * 1e9)
     refuse_if(
         start > stamps[-1],
-        f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
-        f"got {(start - stamps[0]) * 1e-9:.2f} s",
-        remedy="give an earlier --start-time",
+        f"{inputs.source.name}: --start-time: expected at most {(stamps[-1] - stamps[0]) * 1e-9:.2f} s, the end "
+        f"of joint states, got {(start - stamps[0]) * 1e-9:.2f} s",
+        remedy="give an earlier one",
     )
     return start
 

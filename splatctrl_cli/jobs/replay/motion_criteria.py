@@ -356,7 +356,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
         name="clearance",
         find=clearance,
         broken=f"{BROKEN}; {UNKNOWN} if only occupied voxels without a splat break it (raise `--max-splats`), or if "
-        "an object near from the first state on may be part of a link that hardly moves",
+        "an object that is near from the start may be part of a link that hardly moves",
     ),
     Criterion(
         name="certified clearance",

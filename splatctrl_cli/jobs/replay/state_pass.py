@@ -167,7 +167,7 @@ class ReplayRecord:
         return events_of(trace.stamp_ns, signals, near)
 
     def _judge_scene(self, part: AuditTrace) -> AuditTrace:
-        """Leave declared contact out, and let objects come nearer before the next map."""
+        """Leave declared contact out, and let objects approach until the next map."""
         clearance, of_spheres, moving = dict(part.clearance), dict(part.of_spheres), self._reach.moving
         known = self._scene.at(int(part.stamp_ns[0]))
         for name, each in part.of_spheres.items():
@@ -185,8 +185,8 @@ class ReplayRecord:
     ) -> Float64:
         """Clearances `each` (T, M) [m], lowered linearly in time to the next map's.
 
-        So objects come nearer evenly. Maps known late, or over `UNWATCHED_NS` apart, change nothing. pick: the
-        distance of a map.
+        This assumes that objects approach at constant speed. Maps known late, or over `UNWATCHED_NS` apart, change
+        nothing. pick: the distance of a map.
         """
         scene, now_ns = self._scene, int(stamps[0])
         first, next_ns = scene.depth_ns(now_ns), scene.next_ns(now_ns)

@@ -91,8 +91,8 @@ MAP_AGE = Bound(
 
 def map_age(judged: Judged) -> Iterator[Reason]:
     """The map is at most `--max-map-age` old (a baked field: from its moment).
-    Newer depth shows nothing within the margin. This depth is of a state's own time, missing in a late map
-    (`--latency`), or the next after the last state.
+    With `--latency`, depth of a state's own time shows nothing within the margin; nor does the next depth after the
+    last state.
     """
     yield from _overtaken(judged)
     has_clock = judged.inputs.source.has_clock
@@ -134,7 +134,7 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap over `verdict.longest_interval` lets the arm reach the margin within its velocity limits.
+    """Velocity limits keep the arm outside the margin in gaps over `verdict.longest_interval`.
     No state lacks a distance or was dropped for its stamp (*judged states*). At most `verdict.lead_in` is before
     the first map.
     """

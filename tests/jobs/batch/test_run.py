@@ -38,7 +38,7 @@ def test_what_is_done_is_kept_and_what_changed_runs_again_with_what_needs_it(tmp
     nodes = [first, second, other]
 
     def counts(nodes: Sequence[Node], **more: bool) -> list[int]:
-        """How often each ran so far, after a batch of some."""
+        """Run a batch of these nodes; return how often each of the three has run."""
         assert {*states(batch_of(tmp_path, nodes, **more)).values()} == {DONE}
         return [count(tmp_path / f"t{k}") for k in (1, 2, 3)]
 

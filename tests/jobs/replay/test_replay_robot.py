@@ -50,7 +50,7 @@ def with_spheres(desk: Desk, spheres: SphereSet) -> Desk:
     return desk
 
 
-def about(desk: Desk, out: str = "out") -> dict[str, str]:
+def about_of(desk: Desk, out: str = "out") -> dict[str, str]:
     return dict(desk.json("summary.json", out)["about"])
 
 
@@ -68,7 +68,7 @@ def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> fl
 def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotModel) -> None:
     with_spheres(desk, shrunk(arm.sphere_set))
     assert desk.replay(*scene_of(desk, BALL), "-q") == 0
-    report, told = coverage_deficit(arm.urdf, shrunk(arm.sphere_set)), about(desk)["coverage"]
+    report, told = coverage_deficit(arm.urdf, shrunk(arm.sphere_set)), about_of(desk)["coverage"]
     assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
     proven = f"up to {1e3 * report.worst.deficit.proven:.2f} mm"  # type: ignore[union-attr]
     assert all(words in told for words in (report.worst.link, proven, "where they keep 20 mm the surface keeps"))
@@ -113,7 +113,7 @@ def test_what_no_deficit_is_known_of_is_named_and_refused_as_a_margin(
     scene = scene_of(desk, BALL)
     change(desk, arm)
     assert desk.replay(*scene, "-q") == 0 and desk.metrics()["coverage_deficit"] is None
-    assert re.search(told, about(desk)["coverage"])
+    assert re.search(told, about_of(desk)["coverage"])
     assert desk.replay(*scene, "-q", "--force", "--set", "control.coverage=margin") == 4
     assert re.search(refusal, capsys.readouterr().err, flags=re.DOTALL)
 
@@ -148,12 +148,12 @@ def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: 
     tips = arm.sphere_set.centers[mine, 2] + arm.sphere_set.radii[mine]
     ball = (tuple((place @ [*arm.sphere_set.centers[mine][tips.argmax()][:2], tips.max() + 0.06, 1.0])[:3]), 0.05)
     assert desk.replay(*scene_of(desk, ball), "--mode", "closed-loop", "-q") == 0  # type: ignore[arg-type]
-    told = about(desk)["by_surface"]
+    told = about_of(desk)["by_surface"]
     assert re.fullmatch(r"spheres that keep less than the margin, .* surfaces keep it: [1-9] of hand", told)
     assert desk.metrics()["num_relaxed"] == 0
     field = write_field(desk.folder / "field", ball)  # type: ignore[arg-type]
     assert desk.replay("--field", str(field), "--mode", "closed-loop", "-q", out="grid") == 0
-    assert "by_surface" not in about(desk, "grid")
+    assert "by_surface" not in about_of(desk, "grid")
 
 
 def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) -> None:
@@ -196,7 +196,7 @@ def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
     assert re.fullmatch(
         "self-collision margin: 60 mm, or what spheres can keep: .*link5 and link7.*"
         "whether links touch is judged by their surfaces",
-        about(desk)["self_margins"],
+        about_of(desk)["self_margins"],
     )
 
 

@@ -41,7 +41,7 @@ def reported(path: Path, **more: Any) -> str:
 
 
 def shown(path: Path, script: str) -> dict[str, Any]:
-    """What a script found on the page of a run or batch, which complains of nothing."""
+    """Run a script on the page of a run or batch without errors, and return its results."""
     reported(path)
     found = found_on(path.with_name("page.html"), f"{OPENED} {script}" if "while" not in script else script)
     assert found.pop("complaints") == []
