@@ -252,7 +252,7 @@ def check_folder(
 
 def _states(source: FrameSource, logged: StateColumns, model: RobotModel | None) -> RobotStates:
     if len(logged) and source.has_clock:
-        return robot_states(model, source.joint_names, logged)
+        return robot_states(model, source.joint_names, logged, source.tf_frames)
     lack = "" if len(logged) else "no joint states; give them apart (splatctrl help replay, Logs)"
     return RobotStates(model=model, lack=lack)
 

@@ -306,7 +306,8 @@ def check_log(
     correction = read_correction(options, log.path.name)
     late_ns = {c.name: correction.late_ns(c.name) for _, c in whole if correction is not None}
     frames = {c.name: reduced_frames(t, c, watch.images, log_survey.tf, options, late_ns) for t, c in whole}
-    of_states = log_states(log_survey, options, model)
+    base = log_survey.tf.still_frames(whole[0][1].world_frame) if whole else {}
+    of_states = log_states(log_survey, options, model, base)
     if correction is not None:
         frames = {name: list(map(correction.frame, its)) for name, its in frames.items()}
         if of_states.states is not None:

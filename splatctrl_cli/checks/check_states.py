@@ -1,6 +1,6 @@
 """Checks of joint states: values, units, velocities, limits and end-effector poses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -237,7 +237,9 @@ class RobotStates:
     findings: Sequence[Finding] = ()
 
 
-def log_states(survey: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
+def log_states(
+    survey: Survey, options: SourceOptions, model: RobotModel | None, frames: Mapping[str, Float64 | None]
+) -> RobotStates:
     findings: list[Finding] = []
     for topic in survey.select_types(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
@@ -259,18 +261,23 @@ def log_states(survey: Survey, options: SourceOptions, model: RobotModel | None)
             lack="no joint states; record /joint_states, or give the states apart (splatctrl help replay, Logs)",
             findings=findings,
         )
-    of_robot = robot_states(model, names, states)
+    of_robot = robot_states(model, names, states, frames)
     is_said = any(f.code == "joints-degrees" for f in findings)
     more = [f for f in of_robot.findings if not (is_said and f.code == "joints-degrees")]
     return replace(of_robot, findings=[*findings, *more])
 
 
-def robot_states(model: RobotModel | None, names: Sequence[str], states: StateColumns) -> RobotStates:
-    """States of joints `names`, like `log_states`."""
+def robot_states(
+    model: RobotModel | None,
+    names: Sequence[str],
+    states: StateColumns,
+    frames: Mapping[str, Float64 | None],
+) -> RobotStates:
+    """States of joints `names`, like `log_states`; frames: as in `RobotModel.moved_by`."""
     if model is None:
         return RobotStates(model=None, states=states)
-    model = model.moved_by(names)
     try:
+        model = model.moved_by(names, frames)
         states = states.convert_joints(*model.joint_columns(names))
     except InputError as wrong:
         return RobotStates(

@@ -320,7 +320,7 @@ LOCK = option(
     "hold a joint, and what mimics it, at a value [rad or m]",
     fields={"locked": _pairs(partial(_number_of, "--lock", "JOINT"))},
 )
-BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
+BASE = option(f"--base {POSE}", "pose of the URDF's root in the world (default: by tf, else at its origin)", pose)
 
 
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")

@@ -150,6 +150,7 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
         f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
         remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
     )
+    model = model.moved_by(source.joint_names, source.tf_frames)
     states = source.states.convert_joints(*model.joint_columns(source.joint_names))
     return Arm(model, states.postures(fixed.STATES_CLOSE_NS))
 

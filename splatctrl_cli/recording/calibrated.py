@@ -167,7 +167,7 @@ class ChangedSource(FrameSource):
     def __init__(self, source: FrameSource, change: "Correction | Perturbation", tolerance_ns: int) -> None:
         self.inner, self._change, self._tolerance_ns = source, change, tolerance_ns
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
-        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+        self.has_clock, self.world_frame, self.tf_frames = source.has_clock, source.world_frame, source.tf_frames
         self.states, self.joint_topics = source.states, source.joint_topics
         if isinstance(change, Correction) and change.clock_ns:
             self.states, self.joint_topics = change.states(source.states), None

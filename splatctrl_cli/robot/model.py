@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pinocchio
@@ -45,7 +46,7 @@ class RobotModel:
         urdf: UrdfFile,
         model: pinocchio.Model,
         spheres: SphereSet,
-        T_world_base: Float64,
+        T_world_base: Float64 | None,
         left_out: Sequence[str],
         *,
         are_links_renamed: bool,
@@ -54,8 +55,9 @@ class RobotModel:
     ) -> None:
         self._model = model
         self.urdf = urdf
-        self.T_world_base = T_world_base
-        self.base_position: Float64 = np.array(T_world_base[:3, 3])
+        self._given_base = T_world_base
+        self.T_world_base: Float64 = np.eye(4) if T_world_base is None else T_world_base
+        self.base_position: Float64 = np.array(self.T_world_base[:3, 3])
         self.joint_names: tuple[str, ...] = tuple(str(name) for name in model.names)[1:]
         self.sphere_set = spheres
         self.left_out = tuple(left_out)
@@ -110,14 +112,14 @@ class RobotModel:
     ) -> "RobotModel":
         """Build the robot of a URDF, with given spheres or `default_spheres`.
 
-        T_world_base (4, 4): of the root link (default: world origin). locked: joints fixed at values [rad or m], with
-        mimics. packages: folders for ``package://``, as in `read_solids`. Raises InputError.
+        T_world_base (4, 4): of the root link (default: tf's, see `moved_by`, else the world's origin). locked: joints
+        fixed at values [rad or m], with mimics. packages: folders for ``package://``, as in `read_solids`.
+        Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
             model = pinocchio.buildModelFromXML(file.text)
         model = _without(model, file.add_followers(locked or {}), file.path)
-        T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             spheres = default_spheres(file, packages)
         unmatched = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
@@ -126,19 +128,30 @@ class RobotModel:
             file,
             model,
             sphere_set,
-            T,
+            T_world_base,
             left_out,
             are_links_renamed=are_links_renamed(unmatched, file),
             packages=packages,
         )
 
-    def moved_by(self, names: Sequence[str]) -> "RobotModel":
-        """Robot for a log of these joints.
+    def moved_by(
+        self, names: Sequence[str], frames: Mapping[str, Float64 | None] = MappingProxyType({})
+    ) -> "RobotModel":
+        """Robot for a log of these joints and tf frames.
 
-        Unmoved fingers and their mimics are locked in the middle of their limits (`locked`).
+        frames: T_world_frame (4, 4) [m], None if tf moves it. The root is where tf has it, unless T_world_base was
+        given. Unmoved fingers and their mimics are locked in the middle of their limits (`locked`). Raises InputError
+        if tf moves the root.
         """
+        root, base = self.urdf.root, self._given_base
+        refuse_if(
+            base is None and root in frames and frames[root] is None,
+            f"tf moves '{root}', the robot's root, in the world frame; expected a fixed robot",
+            remedy=f"give --world-frame {root}, or --base with its pose",
+        )
+        base = frames.get(root) if base is None else base
         fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
-        if not fingers:
+        if not fingers and base is self._given_base:
             return self
         middle = dict(zip(self.joint_names, self.middle, strict=True))
         led = {joint.name for joint in self.urdf.joints if joint.mimic is not None and joint.mimic[0] in fingers}
@@ -147,11 +160,11 @@ class RobotModel:
             self.urdf,
             _without(self._model, locked, self.urdf.path),
             self.sphere_set,
-            self.T_world_base,
+            base,
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
-            locked={name: locked[name] for name in self.joint_names if name in locked},
+            locked=self.locked | {name: locked[name] for name in self.joint_names if name in locked},
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":

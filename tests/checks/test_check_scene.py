@@ -54,7 +54,7 @@ def table(plain_arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Table:
     options = RecordingOptions(fps=1.25, color_rays=1)  # no more images than check keeps
     simulate(SimulateRequest(out=folder / "log", options=options))
     log = open_raw_log(folder / "log" / "log.mcap")
-    states = log_states(survey(log), SourceOptions(), model).states
+    states = log_states(survey(log), SourceOptions(), model, {}).states
     frames = check_log(log, SourceOptions(), only_errors=True).frames
     stamps = sorted({frame.stamp_ns for frame in frames})[::2]
     few = [frame for frame in frames if frame.stamp_ns in stamps and frame.camera != "cam3"]

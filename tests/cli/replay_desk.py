@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ class FakeSource:
     name: str = "fake.mcap"
     has_clock: bool = True
     loss: LossReport = field(default_factory=LossReport)
+    tf_frames: Mapping[str, Float64 | None] = field(default_factory=dict)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """States are kept as columns, as logs have them."""

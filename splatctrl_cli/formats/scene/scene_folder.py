@@ -35,7 +35,7 @@ SELF_MODEL = "self.npz"  # what `robot learn` finds in the recording
 SHELL_FILE = "shell.ply"
 MAP_DELAYS = "map_delays_s"  # metric of a lockstep in real time: from each snapshot's frames until it was known
 MADE_FROM = (  # metrics of a reconstruction that go with a field
-    *("first_frames", "robot_joints", "robot_links"),
+    *("first_frames", "robot_joints", "robot_links", "robot_base"),
     *("displaced_cameras", "self_mask", "self_mask_residual_mm"),
 )
 T = TypeVar("T")

@@ -121,7 +121,7 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
         not newest, f"{log}: no frame of {', '.join(cameras)} up to the time of the scene", error=NotEvaluableError
     )
     urdf, names = request.urdf, recording.joint_names
-    robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names)
+    robot = None if urdf is None else RobotModel.from_urdf(urdf, request.spheres).moved_by(names, recording.tf_frames)
     spheres = [
         None
         if robot is None or at is None

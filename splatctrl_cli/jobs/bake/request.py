@@ -222,7 +222,9 @@ def choose_box(request: BakeRequest, source: BakeSource, previous: Previous | No
     if request.box is not None:
         return request.box
     if request.urdf is not None:
-        return RobotModel.from_urdf(request.urdf, request.spheres).reach_box
+        base = source.made_from.get("robot_base")
+        T = None if base is None else np.array(base)
+        return RobotModel.from_urdf(request.urdf, request.spheres, T_world_base=T).reach_box
     padding = request.config.field.padding
     return bounding_box(field_splats(source.splats, request.labels), padding) if previous is None else previous.box
 

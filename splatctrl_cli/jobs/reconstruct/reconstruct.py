@@ -172,7 +172,8 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     try:
         model = request.posed(urdf)
         if request.source.joint_names:
-            model = model.moved_by(request.source.joint_names)
+            frames = request.source.tf_frames if isinstance(request.source, FrameSource) else {}
+            model = model.moved_by(request.source.joint_names, frames)
             model.joint_columns(request.source.joint_names)
         model = add_self_model(model, request.self_model)
         if request.urdf is None:
@@ -224,7 +225,7 @@ def learn_robot(request: LearnRequest, progress: Progress = SILENT) -> SelfModel
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         source = open_source(request.log, request.options)
         _check_has_states(source)
-        arm = arm_of(model.moved_by(source.joint_names), source)
+        arm = arm_of(model.moved_by(source.joint_names, source.tf_frames), source)
         frames = frames_of(arm, source, progress)
         off = displaced_cameras(arm, frames)
         learned = learn_from(arm, [correct_pose(frame, off) for frame in frames], source.name, request.reach)

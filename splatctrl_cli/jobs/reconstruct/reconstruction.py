@@ -273,6 +273,7 @@ class Reconstruction:
             "relocated": sum(row.relocated for row in self.rows),
             "robot_joints": None if self.robot is None else list(self.robot.joint_names),
             "robot_links": None if self.robot is None else self.robot.extents(),
+            "robot_base": None if self.robot is None else self.robot.T_world_base.tolist(),
             "unmet": last.unmet,
             "evicted": sum(row.evicted for row in self.rows),
             "unrepresented_voxels": last.unrepresented,

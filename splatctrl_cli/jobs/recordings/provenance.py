@@ -182,6 +182,10 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
         return ""
     if tuple(joints) != tuple(model.joint_names):
         return f"with joints {', '.join(joints)}"
+    base = np.array(made_from.get("robot_base") or model.T_world_base)
+    if not np.allclose(base, model.T_world_base, atol=fixed.SAME_LINK):
+        x, y, z = base[:3, 3]
+        return f"its root at ({x:.3f}, {y:.3f}, {z:.3f}) m or turned otherwise: give that place with --base"
     theirs, ours = made_from.get("robot_links"), model.extents()
     if theirs is None:
         return "of which an earlier version stored the joints alone"

@@ -92,7 +92,7 @@ def write_replay(
         command="replay",
         config=config.as_dict(),
         inputs=inputs,
-        metrics=metrics,
+        metrics={**metrics, "robot_base": replay.model.T_world_base.tolist()},
         stopwatch=stopwatch,
         verdict=verdict.as_dict(),
     )

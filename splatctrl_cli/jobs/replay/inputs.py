@@ -74,7 +74,8 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
     )
     if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
         progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
-    return add_self_model(model.moved_by(source.joint_names), request.self_model, request.scene), source
+    model = model.moved_by(source.joint_names, source.tf_frames)
+    return add_self_model(model, request.self_model, request.scene), source
 
 
 @dataclass(frozen=True, kw_only=True)

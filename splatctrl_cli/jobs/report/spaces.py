@@ -108,12 +108,19 @@ def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> Ro
     refuse_if(
         "urdf" not in places, f"{run.path}: its command line has no --urdf", remedy="replay with the command line"
     )
-    base = run.option("--base")
+    base, word = run.run.get("metrics", {}).get("robot_base"), run.option("--base")
+    if base is None and word is not None:  # an earlier version's
+        numbers = [float(part) for part in word.split(",")]
+        base = transform_from(numbers[:3], numbers[3:])
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
-    pose = None if base is None else tuple(float(part) for part in base.split(","))
     robot = _robot(
-        places["urdf"], places.get("spheres"), pose, locks, packages, tuple(sha256(path) for path in places.values())
+        places["urdf"],
+        places.get("spheres"),
+        None if base is None else tuple(map(tuple, base)),
+        locks,
+        packages,
+        tuple(sha256(path) for path in places.values()),
     )
     return robot.moved_by(tuple(states.joints))
 
@@ -122,13 +129,13 @@ def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> Ro
 def _robot(
     urdf: Path,
     spheres: Path | None,
-    pose: tuple[float, ...] | None,
+    T_world_base: tuple[tuple[float, ...], ...] | None,
     locks: tuple[tuple[str, float], ...],
     packages: tuple[Path, ...],
     _digests: tuple[str, ...],
 ) -> RobotModel:
     """Cached: runs of a batch share robots."""
-    T = None if pose is None else transform_from(pose[:3], pose[3:])
+    T = None if T_world_base is None else np.array(T_world_base)
     return RobotModel.from_urdf(urdf, spheres, T_world_base=T, locked=dict(locks), packages=packages)
 
 

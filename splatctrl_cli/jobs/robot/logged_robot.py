@@ -30,8 +30,8 @@ TAKE = "leave --urdf out to take the log's own, or correct the file"
 class RobotOptions:
     """Options to read a robot's URDF.
 
-    spheres: None for `default_spheres`. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw.
-    locked: values [rad or m] of unlogged joints.
+    spheres: None for `default_spheres`. packages: mesh folders. base: root pose in world, x, y, z, qx, qy, qz, qw,
+    None for tf's. locked: values [rad or m] of unlogged joints.
     """
 
     spheres: Path | None = None
@@ -118,10 +118,10 @@ def add_self_model(model: RobotModel, file: Path | None, scene: Path | None = No
 
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
-    """Sentence if a log's poses are not in the robot's root frame, else empty."""
-    if not isinstance(source, LOGGED) or source.world_frame == file.root:
+    """Sentence if a log does not say where the robot's root is, else empty."""
+    if not isinstance(source, LOGGED) or source.world_frame == file.root or file.root in source.tf_frames:
         return ""
-    return f"the poses are in the frame '{source.world_frame}', not in that of its root '{file.root}'"
+    return f"the poses are in the frame '{source.world_frame}', and tf has no frame of its root '{file.root}'"
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:

@@ -17,7 +17,7 @@ from splatctrl_cli.errors import InputError, refuse_faults, refuse_if
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.formats.arrays import DAMAGE, NpzFile, npy_of
 from splatctrl_cli.formats.image_file import decode_file
-from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.geometry import invert_transform, transform_from
 from splatctrl_cli.recording.log.messages import metres
 from splatctrl_cli.recording.log.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.recording.log.state_topics import joint_records
@@ -76,6 +76,17 @@ def _is_loss(value: object) -> bool:
     )
 
 
+def _are_poses(value: object) -> bool:
+    """True for rigid T_world_frame (4, 4), or None, by name."""
+    if not isinstance(value, dict):
+        return False
+    try:
+        poses = [np.array(entry, np.float64) for entry in value.values() if entry is not None]
+    except (TypeError, ValueError):
+        return False
+    return all(T.shape == (4, 4) and np.allclose(T @ invert_transform(T), np.eye(4), atol=1e-6) for T in poses)
+
+
 _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
     ("world_frame", _is_text, "a name"),
     ("has_clock", lambda value: isinstance(value, bool), "true or false"),
@@ -88,6 +99,7 @@ _ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
     ("loss", _is_loss, "counts by name, and notes"),
     ("sources", lambda value: isinstance(value, dict), "sha256 by name"),
     ("name", _is_text, "a name"),
+    ("tf_frames", _are_poses, "a 4x4 matrix or null by name"),
 )
 
 
@@ -110,6 +122,7 @@ def read_capture_header(path: Path) -> dict[str, Any]:
         f"{file}: expected version {VERSION}, got {header.get('version')}",
         remedy="use a newer splatctrl",
     )
+    header = {"tf_frames": {}, **header}  # missing in those of other programs
     check_header(file, header)
     sums = FileSums(path)
     for name in ("capture.json", "frames.csv", "joints.npz"):
@@ -225,6 +238,7 @@ class CaptureSource(FrameSource):
         self.name = path.name
         header = read_capture_header(path)
         self.world_frame = str(header["world_frame"])
+        self.tf_frames = {name: None if T is None else np.array(T) for name, T in header["tf_frames"].items()}
         self.has_clock = bool(header["has_clock"])
         self.made_of = frozenset(header["sources"].values())  # sha256
         applied = (CALIBRATION, PERTURB)

@@ -145,6 +145,7 @@ def write_capture(
         "version": VERSION,
         "name": source.name,
         "world_frame": source.world_frame,
+        "tf_frames": {name: None if T is None else T.tolist() for name, T in source.tf_frames.items()},
         "units": {"length": "m", "time": "ns", "angle": "rad"},
         "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
         "pixels": "pixel (0, 0) is centred at u = v = 0",

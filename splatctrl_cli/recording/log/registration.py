@@ -3,7 +3,9 @@
 import re
 from array import array
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeVar
 
 import cv2
@@ -73,6 +75,12 @@ class _Edge:
         if gap > TF_GAP_NS and not _is_still(T_before, T_after):
             return None
         return interpolate_transform(T_before, T_after, (stamp_ns - self.stamps[after - 1]) / gap)
+
+    def still(self) -> Float64 | None:
+        """T_parent_child (4, 4) if it never changes, else None."""
+        poses = iter(self.static.values()) if self.static else map(self._at, range(len(self.stamps)))
+        first = next(poses)
+        return first if all(_is_still(first, T) for T in poses) else None
 
     def _at(self, sample: int) -> Float64:
         number = self.numbers[sample]
@@ -162,21 +170,28 @@ class TfTree:
 
     def lookup(self, target: str, source: str, stamp_ns: int, tolerance_ns: int = 0) -> Float64 | None:
         """T_target_source (4, 4) at a time; None if unconnected or unknown then."""
-        target, source = target.strip("/"), source.strip("/")
+        return self._pose(target.strip("/"), source.strip("/"), lambda edge: edge.at(stamp_ns, tolerance_ns))
+
+    def still_frames(self, target: str) -> dict[str, Float64 | None]:
+        """T_target_frame (4, 4) by connected frame; None if it changes."""
+        still = cache(_Edge.still)
+        return {frame: self._pose(target, frame, still) for frame in self.frames if self.connects(target, frame)}
+
+    def _pose(self, target: str, source: str, of_edge: Callable[[_Edge], Float64 | None]) -> Float64 | None:
         up_target, up_source = self._ancestors(target), self._ancestors(source)
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None:
             return None
-        T_common_source = self._chain(up_source, common, stamp_ns, tolerance_ns)
-        T_common_target = self._chain(up_target, common, stamp_ns, tolerance_ns)
+        T_common_source = self._chain(up_source, common, of_edge)
+        T_common_target = self._chain(up_target, common, of_edge)
         if T_common_source is None or T_common_target is None:
             return None
         return invert_transform(T_common_target) @ T_common_source
 
-    def _chain(self, ancestors: list[str], top: str, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+    def _chain(self, ancestors: list[str], top: str, of_edge: Callable[[_Edge], Float64 | None]) -> Float64 | None:
         T = np.eye(4)
         for frame in ancestors[: ancestors.index(top)]:
-            T_parent_frame = self._edges[frame].at(stamp_ns, tolerance_ns)
+            T_parent_frame = of_edge(self._edges[frame])
             if T_parent_frame is None:
                 return None
             T = T_parent_frame @ T

@@ -228,6 +228,7 @@ class RosLogSource(FrameSource):
                 remedy=f"copy the file again; if this is all there is: {error.remedy}",
             ) from None
         self._tf = log_survey.tf
+        self.tf_frames = self._tf.still_frames(self._rig[0].world_frame)
         self._loss = LossReport(
             damaged=log_survey.damage.count, notes=[*log_survey.damage.all_notes, *log_survey.tf.notes]
         )

@@ -10,6 +10,7 @@ from functools import cached_property
 from io import BytesIO
 from math import prod
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, TypeVar
 
 import numpy as np
@@ -228,6 +229,7 @@ class FrameSource:
 
     world_frame: the source's frame of poses. states: by stamp, without reading frames. joint_topics: those that a log
     has, None if unknown. depth_fault: why no frame has depth, None where some may; only image folders have one.
+    tf_frames: T_world_frame (4, 4) [m] by frame, None if tf moves it.
     """
 
     name: str
@@ -238,6 +240,7 @@ class FrameSource:
     states: StateColumns = NO_STATES
     joint_topics: JointTopics | None = None
     depth_fault: InputError | None = None
+    tf_frames: Mapping[str, Float64 | None] = MappingProxyType({})
 
     @property
     def loss(self) -> LossReport:

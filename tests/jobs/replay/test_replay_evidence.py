@@ -72,6 +72,7 @@ def test_a_scene_that_belongs_to_its_log_is_safe(stage: Stage) -> None:
 
 
 JOINTS = [f"joint{number}" for number in range(1, 8)]
+ON_A_STAND = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.8], [0, 0, 0, 1]]
 NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     "other digests": (lambda s: of_run(s, inputs={"fake.mcap": "1" * 64}), "was made from another recording"),
     "another robot": (
@@ -81,6 +82,10 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     "a table among the robot's links": (
         lambda s: of_run(s, metrics={"robot_joints": JOINTS, "robot_links": {"cell": [0, 0, 0, 1, 1, 1, 6]}}),
         "another robot, with link cell, which this one does not have",
+    ),
+    "a robot on a stand": (
+        lambda s: of_run(s, metrics={"robot_joints": JOINTS, "robot_base": ON_A_STAND}),
+        "another robot, its root at (0.000, 0.000, 0.800) m or turned otherwise: give that place with --base",
     ),
     "depth that no sensor measured": (
         lambda s: of_run(s, metrics={"depth_bend": 0.02}),

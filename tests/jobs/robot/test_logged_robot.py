@@ -12,13 +12,15 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.check import CheckRequest, IngestRequest, check, ingest
 from splatctrl_cli.jobs.reconstruct.reconstruct import _robot
 from splatctrl_cli.jobs.reconstruct.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay.inputs import open_log
 from splatctrl_cli.jobs.replay.request import ReplayRequest
-from splatctrl_cli.jobs.report.spaces import space_of
+from splatctrl_cli.jobs.report.spaces import robot_of, space_of
 from splatctrl_cli.jobs.robot.logged_robot import differs, logged_urdf, urdf_of
+from splatctrl_cli.jobs.runs.run_folder import open_run
 from splatctrl_cli.recording.capture.capture import is_capture
 from splatctrl_cli.recording.container.raw_log import RawMessage
 from splatctrl_cli.recording.source import describe, open_source
@@ -29,9 +31,11 @@ from tests.recording.log.make_log import (
     START_NS,
     STORE,
     LogRecipe,
+    built,
     encoded,
     make_log,
     messages_of,
+    transform,
     write_bag,
     write_raw,
 )
@@ -201,7 +205,7 @@ MESH = '<collision><geometry><mesh filename="package://r/a.stl"/></geometry></co
     [
         (robot(), {}, ""),
         (robot(shape=MESH), {}, "mesh package://r/a.stl was not found; give the folder that holds its package"),
-        (robot(root="base"), {}, "the poses are in the frame 'world', not in that of its root 'base'"),
+        (robot(root="base"), {}, "the poses are in the frame 'world', and tf has no frame of its root 'base'"),
         (robot(), {"has_joints": False}, "expected joint states, got none"),
     ],
     ids=["it can", "no meshes", "elsewhere", "no states"],
@@ -240,6 +244,44 @@ def test_a_replay_says_where_it_places_the_robot_of_the_log(tmp_path: Path) -> N
         assert told.lines == []
 
 
+PLACE = transform_from([0.3, -0.2, 0.8], [0.0, 0.0, 0.6, 0.8])
+
+
+def log_on_a_stand(path: Path, *places: tuple[float, float, float]) -> Path:
+    """The log of `make_log` whose tf has the robot's root `base` at each of these places in turn."""
+    edges = [transform(START_NS + k, "world", "base", place, (0.0, 0.0, 0.6, 0.8)) for k, place in enumerate(places)]
+    tf = [encoded(START_NS, "/tf", built("tf2_msgs/msg/TFMessage", transforms=[edge])) for edge in edges]
+    return log_with(path, described(robot(root="base")), *tf)
+
+
+@pytest.mark.parametrize("kind", ["log", "capture"])
+def test_the_robot_stands_where_tf_has_its_root(tmp_path: Path, kind: str) -> None:
+    path, urdf = log_on_a_stand(tmp_path / "run.mcap", (0.3, -0.2, 0.8)), written(tmp_path, robot(root="base"))
+    if kind == "capture":
+        ingest(IngestRequest(paths=(path,), out=tmp_path / "run.capture"))
+        path = tmp_path / "run.capture"
+    request, said = ReplayRequest(log=path, out=tmp_path / "out"), Said()
+    for given in ({}, {"urdf": urdf}):
+        assert open_log(replace(request, **given), said)[0].T_world_base == pytest.approx(PLACE, abs=1e-9)
+    assert not any("placed" in line for line in said.lines)
+    mapped = ReconstructRequest(source=open_source(path), out=tmp_path / "scene", recording=path)
+    assert _robot(mapped, Said()).T_world_base == pytest.approx(PLACE, abs=1e-9)
+    checked = check(CheckRequest(paths=(path,), urdf=urdf))[0]
+    assert not checked.obstacles("replay")
+    given = open_log(replace(request, base=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))[0]
+    assert given.T_world_base == pytest.approx(transform_from([1, 0, 0], [0, 0, 0, 1])), "--base overrides tf"
+
+
+def test_a_robot_that_tf_moves_is_refused_unless_its_place_is_given(tmp_path: Path) -> None:
+    path = log_on_a_stand(tmp_path / "run.mcap", (0.3, -0.2, 0.8), (0.31, -0.2, 0.8))
+    request = ReplayRequest(log=path, out=tmp_path / "out")
+    expect_refusal("tf moves 'base', the robot's root.*give --world-frame base, or --base", open_log, request)
+    urdf = written(tmp_path, robot(root="base"))
+    found = check(CheckRequest(paths=(path,), urdf=urdf))[0].obstacles("replay")
+    assert ["tf moves 'base'" in text for text in found] == [True, True]
+    assert open_log(replace(request, base=(0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0)))[0].base_position[2] == 0.8
+
+
 def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,10 +291,13 @@ def test_a_replay_keeps_the_robot_of_its_log_for_who_looks_at_it(
     log = write_raw(stage.desk.folder / "x.mcap", [described(Path(urdf).read_text()), *states])
     out = stage.desk.folder / "out"
     words = ["replay", str(log), "--spheres", spheres, "--scene", str(stage.scene()), "-o", str(out), "-q"]
+    words += ["--base=0,0,0.002,0,0,0,1"]
     monkeypatch.setattr(sys, "argv", ["splatctrl", *words])
     assert main(words) == 0
     assert (out / "robot_description.urdf").read_text() == Path(urdf).read_text()
     log.unlink()
+    run = open_run(out)
+    assert robot_of(run, run.states).base_position == pytest.approx([0, 0, 0.002])
     assert space_of(out).motion is not None
 
 

@@ -279,6 +279,7 @@ CAMERA = {"width": 8, "height": 6, "fx": 9.0, "fy": 9, "cx": 3.5, "cy": 2.5, "de
 HEADER: dict[str, Any] = {
     **{"world_frame": "world", "has_clock": True, "joint_names": ["a"], "cameras": {"cam": CAMERA}},
     **{"loss": {"damaged": 1, "notes": ["x"]}, "sources": {}, "name": "x"},
+    **{"tf_frames": {"base": np.eye(4).tolist(), "tip": None}},
 }
 
 
@@ -286,6 +287,7 @@ HEADER: dict[str, Any] = {
     ("name", "value"),
     [
         *(("world_frame", 3), ("has_clock", "yes"), ("joint_names", "ab"), ("joint_names", [1]), ("sources", [])),
+        *(("tf_frames", []), ("tf_frames", {"base": "x"}), ("tf_frames", {"base": np.ones((4, 4)).tolist()})),
         *(("loss", {"odd": 1}), ("loss", {"notes": "x"}), ("loss", []), ("loss", {"damaged": "1"}), ("cameras", [])),
         *(("cameras", {"cam": {**CAMERA, key: value}}) for key in CAMERA for value in ("1", -1, 1e400, True, [])
           if not (key in {"cx", "cy"} and value == -1) and not (key in {"width", "height"} and value is True)),

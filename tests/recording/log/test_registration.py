@@ -12,7 +12,7 @@ import pytest
 from pinocchio.rpy import rpyToMatrix
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.geometry import pose_at, rotation_from_quat, transform_from
+from splatctrl_cli.geometry import invert_transform, pose_at, rotation_from_quat, transform_from
 from splatctrl_cli.recording.log.registration import Lens, TfTree, undistort_lens, warp_depth
 from splatctrl_cli.recording.source import SourceOptions, describe, open_source
 from splatctrl_cli.records import Float64, Intrinsics
@@ -191,6 +191,20 @@ def test_siblings_are_joined_through_their_common_ancestor() -> None:
     tree.add("map", "other", 0, np.zeros(3), IDENTITY, static=True)
     assert tree.lookup("world", "other", 0) is None, "not connected"
     assert (tree.roots, tree.root_of("camera")) == (("map", "world"), "world")
+
+
+def test_still_frames_have_one_pose_for_the_whole_log() -> None:
+    """The lamp hangs on a mount that a driver publishes again and again; the camera moves with the base."""
+    tree = moving_tree()
+    for stamp in (0, 500_000_000, 9_000_000_000):
+        tree.add("world", "mount", stamp, np.array([0, 0, 2.0]), QUARTER_TURN, static=False)
+    tree.add("mount", "lamp", 0, np.array([0.1, 0, 0]), IDENTITY, static=True)
+    tree.add("elsewhere", "other", 0, np.zeros(3), IDENTITY, static=True)
+    frames = tree.still_frames("world")
+    assert (frames["base"], frames["camera"], frames.keys() & {"other", "elsewhere"}) == (None, None, set())
+    assert frames["lamp"] == pytest.approx(transform_from([0, 0.1, 2.0], QUARTER_TURN), abs=1e-12)
+    assert frames["world"] == pytest.approx(np.eye(4))
+    assert tree.still_frames("lamp")["world"] == pytest.approx(invert_transform(frames["lamp"]), abs=1e-12)
 
 
 def test_outside_the_recorded_time_nothing_is_known_beyond_the_tolerance() -> None:
