@@ -50,8 +50,8 @@ missing | error | all | depth, CameraInfo or tf that `ingest` needs
 refused | error | all | the capture or folder cannot be read as described
 gap | warning |  | a topic pauses for over 0.1 s and three median intervals | record fewer topics or to a faster disk;
     what moved meanwhile is unknown
-part | note, warning |  | a topic begins over 1 s late or ends over 1 s early; a warning from a tenth of the log |
-    start and stop all drivers with the recorder, or cut the log there
+part | note, warning |  | a topic begins over 1 s late or ends over 1 s early; a warning if over a tenth of the
+    log is missing | start and stop all drivers with the recorder, or cut the log there
 files-apart | warning |  | over 60 s between two files | are they one recording? if not, give each alone
 stamp-repeats | warning |  | repeated header stamps | look for a driver that publishes twice, or a topic recorded
     twice
@@ -107,14 +107,14 @@ pose-missing | warning, error | all | images without a pose; an error if all | t
     has a gap of more than 1 s; if it stands still give --camera-pose
 pose-jump | error | later | a camera moves over 0.2 m and ten times its median step in one frame | two publishers of
     one frame, or a localisation that was corrected; reconstruct refuses it
-alignment | error | later | edges of depth and colour are over 1.5 % of the width apart, or match across cameras
+alignment | error | later | edges of depth and colour are over 1.5 % of the width apart, or match another camera's
 views-scale | warning, error | later | depths fit only with a factor; a warning at little overlap
 views-pose | warning |  | views fit only after a camera moves (by 12 mm or 0.8 deg)
 agreement | note, error | later | how far apart views place one surface [mm]; an error beyond 30 mm (3 % of depth
     above 1 m)
 views-agreement | error | later | the same for views of one camera
 exposure | note |  | a surface's brightness or colour differs by over 5 % between images
-exposure-rows | note |  | rows of one image are over 20 % brighter than others
+exposure-rows | note |  | exposure differs by over 20 % between rows of one image (flicker)
 joints | note, error | replay | topics and velocities in use; an error if joints of the robot are missing
 joints-nan | warning |  | positions that are not finite | they are left out; look at the driver
 joints-degrees | error | replay | positions that no joint can reach in radians
@@ -123,8 +123,8 @@ joints-still | note |  | no joint moves
 joints-limits | warning |  | states beyond the URDF's limits | is it the right URDF, are the joints in its units, or
     were its limits lowered?
 end-effector | note, error | replay | logged poses against the robot's kinematics
-arm | note, warning |  | measured minus rendered depth of the robot [mm]; a warning beyond 30 mm (mean 25), from 4 %
-    of scale, or where a quarter shows the background
+arm | note, warning |  | measured minus rendered depth of the robot [mm]; a warning beyond 30 mm (mean 25 mm), a scale
+    error of 4 %, or a quarter of its pixels on the background
 robot-model | warning |  | `--urdf` is another mechanism than the log's
 quick | note |  | only the first images were read
 """

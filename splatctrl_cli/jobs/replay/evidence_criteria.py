@@ -47,7 +47,7 @@ LIMITS = (
         remedy="add a camera that sees that side",
     ),
     Bound(
-        quantity="from a surface of the map to a sphere of the arm, nine tenths of the points about it never seen",
+        quantity="from a surface of the map to a sphere of the arm with 90 % of the points around it never seen",
         why="space that is almost entirely unseen may hold a whole object",
         on="blind_to_surface",
         unit="m",
@@ -57,7 +57,7 @@ LIMITS = (
         remedy="add a camera that sees where the arm goes",
     ),
     Bound(
-        quantity="unanswered, from the arm",
+        quantity="*unanswered*, from the arm",
         why="a dark, shiny or transparent object returns no depth where depth is expected",
         on="class_distance",
         unit="m",
@@ -66,7 +66,7 @@ LIMITS = (
         remedy="a dark, shiny or transparent object may be there: add a camera that gets depth there",
     ),
     Bound(
-        quantity="contradicted, from the arm",
+        quantity="*contradicted*, from the arm",
         why="depth of a shiny object may lie far behind it",
         on="class_distance",
         unit="m",
@@ -76,7 +76,7 @@ LIMITS = (
         remedy="a shiny object may be there: add a camera that sees it, or check depth scale and poses",
     ),
     Bound(
-        quantity="depth edge, from the arm",
+        quantity="*depth edge*, from the arm",
         why="a surface may extend one pixel past an edge without depth",
         on="class_distance",
         unit="m",
@@ -86,7 +86,7 @@ LIMITS = (
         remedy="keep farther from the edge, or add a camera that sees past it or has smaller pixels",
     ),
     Bound(
-        quantity="outside of the workspace, from the arm",
+        quantity="*outside*, from the arm",
         why="the map ends there",
         on="class_distance",
         unit="m",
@@ -109,7 +109,7 @@ BY_FEW = {
 }
 PROOF = Bound(
     quantity="not free, with `--require-proof` or `--unseen occupied`, from the arm",
-    why="such a run would be safe by assumption",
+    why="the verdict would rest on an assumption",
     on="class_distance",
     unit="m",
     parts=tuple(kind for kind in EvidenceClass if kind is not EvidenceClass.FREE),
@@ -169,7 +169,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     if measured is not None and measured.bound is None:
         yield not_evaluable(
             sentence=f"not bounded: {measured.num_seen} of {measured.num_sets} held-out frame sets show surface near "
-            "the motion, too few for two independent stretches",
+            "the motion, too few for two independent blocks",
             who=measured.source,
             remedy="judge a longer motion, name another camera, or raise verdict.evidence_reach",
             count=measured.num_seen,
@@ -181,7 +181,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield passed_reason(bound_words(measured.bound), surface - value, 0.0, "m", measured.num_points)
         return
     yield not_evaluable(
-        sentence=f"{bound_words(measured.bound)}, but the clearance is only {mm(surface)}; largest miss",
+        sentence=f"{bound_words(measured.bound)}, but the clearance is only {mm(surface)}; largest residual",
         value=surface - value,
         threshold=0.0,
         unit="m",
@@ -197,7 +197,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
 def bound_words(bound: ConformalBound) -> str:
     return (
         f"at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
-        f"{bound.num_stretches} stretches of held-out depth"
+        f"{bound.num_stretches} blocks of held-out depth"
     )
 
 
@@ -253,8 +253,8 @@ def calibration(judged: Judged) -> Iterator[Reason]:
 
 
 def map_resolution(judged: Judged) -> Iterator[Reason]:
-    """Voxels are at most 25 mm, the size of an obstacle without a splat.
-    The robot's mask reaches at most the margin, as it may hide an obstacle that touches the robot.
+    """Voxels are at most 25 mm, to which an obstacle without a splat is known.
+    The self-mask extends at most the margin from the robot, because it may hide an obstacle that touches the robot.
     """
     yield from VOXEL(judged)
     yield from BLIND(judged)
@@ -289,8 +289,8 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(
         name="evidence",
         find=attrgetter("inputs.mismatches"),
-        meaning="scene, log and robot belong together: digests, first frames, calibration, times, joints, links; "
-        "files as written; splats that agree with their occupancy grid",
+        meaning="map, log and robot match: digests, first frames, calibration, times, base, joints, links. No file "
+        "was changed. Splats agree with their occupancy grid",
         broken=f"{UNKNOWN}; a changed file is refused (exit 4)",
     ),
     Criterion(name="calibration", find=calibration, broken=UNKNOWN),
@@ -298,11 +298,15 @@ OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
     Criterion(name="known space", find=known_space, broken=f"{UNKNOWN}; failed with `--unseen occupied`"),
     Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
-    Criterion(name="map age", find=map_age, broken=f"{UNKNOWN}; *contact* or *margin broken* by its own depth"),
+    Criterion(
+        name="map age",
+        find=map_age,
+        broken=f"{UNKNOWN}; failed (contact, margin broken) by depth of a state's own time",
+    ),
     Criterion(
         name="clocks",
         find=CLOCKS,
-        meaning="cameras and robot agree within 50 ms beyond the estimate's own uncertainty",
+        meaning="the offset of camera and robot clocks, less its uncertainty, is at most 50 ms",
         broken=UNKNOWN,
     ),
 )

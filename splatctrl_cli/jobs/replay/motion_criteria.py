@@ -33,14 +33,14 @@ from splatctrl_cli.robot.self_margins import least_gap
 
 
 def clearance(judged: Judged) -> Iterator[Reason]:
-    """Every moving link's surface (its spheres without meshes) keeps the margin from the splats."""
+    """Every moving link's surface (its spheres, if it has no mesh) keeps the margin from the splats."""
     represented = lowest(judged.replay.trace["clearance_splats"])
     is_starved = represented is not None and represented >= judged.threshold
     yield from _check_source(judged, "exact", represented if is_starved else None)
 
 
 def certified_clearance(judged: Judged) -> Iterator[Reason]:
-    """The bound between grid cells keeps the margin; judged with a grid alone."""
+    """The grid's lower bound on distance keeps the margin; judged without splats."""
     if "certified" not in judged.replay.fields:
         return
     least, exact = (lowest(judged.replay.trace[f"clearance_{name}"]) for name in ("certified", "exact"))
@@ -154,8 +154,8 @@ def _locate(event: Event, reason: Reason) -> Reason:
 def self_clearance(judged: Judged) -> Iterator[Reason]:
     """No two links overlap.
     No moving link comes within the margin of a fixed one without joints, such as a table.
-    Pairs with a lower margin are driven no nearer than `control.self_margin` (or half of their largest gap), or than
-    recorded. Gaps are of collision surfaces, or of spheres if these cannot be read.
+    The built-in controller drives no pair below `control.self_margin` and below the recorded gap. Gaps are of
+    collision surfaces, or of spheres if these cannot be read.
     """
     trace = judged.replay.trace
     worst = worst_state(trace, trace["self_clearance"], who=trace["self_pair"])
@@ -223,8 +223,8 @@ def _brought_together(judged: Judged) -> Reason | None:
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
-    """No new obstacle comes within a fixed link's margin in two scenes in a row.
-    New means 1 cm or more (3 cm at the mount) from earlier surfaces, in space that was free; others are a note.
+    """No new obstacle is within a fixed link's margin in two consecutive maps.
+    New: at least 1 cm (3 cm at the mount) from earlier surfaces, in space seen free. Other surfaces cause a note.
     """
     broken = {
         name: (first, least)
@@ -282,7 +282,7 @@ def acceleration_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
-    """The spheres' clearance, less the depth of surface outside them, keeps the margin.
+    """The spheres' clearance, minus how far surface stands out of them, keeps the margin.
     Every moving link has a sphere.
     """
     model = judged.replay.model
@@ -318,7 +318,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """A lower bound (by the spheres' lever arms) keeps the margin; intervals that break it are halved."""
+    """A lower bound between states keeps the margin; intervals that break it are halved."""
     model, trace = judged.replay.model, judged.replay.trace
     _, surface, between = _body_clearance(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
@@ -356,7 +356,7 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
         name="clearance",
         find=clearance,
         broken=f"{BROKEN}; {UNKNOWN} if only occupied voxels without a splat break it (raise `--max-splats`), or if "
-        "an object that is near from the start may be part of a link that hardly moves",
+        "an object that is always near a link that hardly moves may be part of it",
     ),
     Criterion(
         name="certified clearance",

@@ -14,7 +14,7 @@ from splatctrl_cli.jobs.replay.criteria import CONTACT, MARGIN, SLOW, Bound, Jud
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
     """Depth near the arm is at most `--max-map-age` old and not newer than the state.
-    After half a second without any, the next depth shows nothing where the arm was. A baked field has no times.
+    After 0.5 s without depth there, the next depth shows no obstacle where the arm was. A baked field has no times.
     """
     first_ns, margin = int(judged.replay.trace.stamp_ns[0]), judged.replay.margin
     for later in judged.replay.unwatched:
@@ -46,7 +46,7 @@ EVIDENCE_AGE = Bound(
     at_most=OLDEST,
     unit="s",
     say="the newest depth near the arm is {value:.2f} s old, allowed {allowed:g} s",
-    passed="depth from about the arm at most {value:.2f} s before",
+    passed="the newest depth near the arm is at most {value:.2f} s old",
     remedy="frames that have no depth or repeat it do not count: check the cameras ('splatctrl check')",
 )
 
@@ -91,8 +91,8 @@ MAP_AGE = Bound(
 
 def map_age(judged: Judged) -> Iterator[Reason]:
     """The map is at most `--max-map-age` old (a baked field: from its moment).
-    With `--latency`, depth of a state's own time shows nothing within the margin; nor does the next depth after the
-    last state.
+    With `--latency`, depth of a state's own time shows no obstacle within the margin; nor does the next depth after
+    the last state.
     """
     yield from _overtaken(judged)
     has_clock = judged.inputs.source.has_clock
@@ -134,9 +134,9 @@ def _overtaken(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """Velocity limits keep the arm outside the margin in gaps over `verdict.longest_interval`.
-    No state lacks a distance or was dropped for its stamp (*judged states*). At most `verdict.lead_in` is before
-    the first map.
+    """Velocity limits keep the arm outside the margin between states over `verdict.longest_interval` apart.
+    Every state has a distance, and none was dropped for its stamp (*judged states*). The first map is at most
+    `verdict.lead_in` later than the first state.
     """
     config, replay = judged.request.config.verdict, judged.replay
     stamps, unbounded, blank = replay.trace.stamp_ns, replay.trace["unbounded_s"], replay.trace["is_blank"]

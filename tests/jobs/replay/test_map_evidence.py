@@ -226,7 +226,7 @@ def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
     ("options", "code", "said"),
     [
         (["--evidence", "cam7"], 4, "no camera 'cam7'; use one of: cam0, cam9"),
-        (["--evidence", "4"], 2, "every frame set of cam0 trained"),
+        (["--evidence", "4"], 2, "was made from every frame set of cam0"),
         (["--evidence", "blind"], 4, "camera blind has no pixel with depth"),
         (["--evidence", "empty"], 4, "camera empty has no pixel with depth"),
     ],
