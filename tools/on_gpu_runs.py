@@ -234,7 +234,7 @@ def failures(desk: Desk, source: str) -> list[str]:
     ends("no such card", desk.reconstruct(source, "a", "cuda:99"), 2, "no such card")
     hidden = {"CUDA_VISIBLE_DEVICES": ""}
     ends("cards are hidden", desk.reconstruct(source, "b", "cuda"), 2, "finds no card", **hidden)
-    ends("cards are hidden, auto", desk.reconstruct(source, "c", "auto"), 0, "computes on cpu", **hidden)
+    ends("cards are hidden, auto", desk.reconstruct(source, "c", "auto"), 0, "computes on the CPU", **hidden)
     ends("auto", desk.reconstruct(source, "d", "auto"), 0, "computes on cuda:0")
     with tempfile.NamedTemporaryFile() as file:
         caches = {"XDG_CACHE_HOME": file.name, "HOME": file.name, "CUDA_CACHE_PATH": file.name}
@@ -266,7 +266,7 @@ def too_full(desk: Desk, ends: Callable[..., str]) -> None:
         "too little memory, auto",
         desk.reconstruct(STILL, "h", "auto", *few, MANY),
         0,
-        "computes on cpu: too little memory",
+        "computes on the CPU (too little memory",
     )
     card.free(held)
 

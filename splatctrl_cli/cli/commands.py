@@ -242,7 +242,7 @@ COMMANDS = {
         options=scene_options.RENDER,
     ),
     "replay": Command(
-        summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",
+        summary="judge the logged motion, compute commands along it, or simulate the arm in closed loop",
         examples=(
             f"replay out/x.capture --scene out/scene {ROBOT} -o out/audit",
             f"replay out/x.capture --scene out/scene {ROBOT} --mode closed-loop --start-time 1.6",

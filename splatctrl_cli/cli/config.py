@@ -2,7 +2,8 @@
 
 import argparse
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -35,6 +36,13 @@ def run_completion(args: argparse.Namespace, console: Console) -> int:
     return console.result({"shell": args.shell, "script": script}, [script])
 
 
+def _pages_about(word: str, texts: Mapping[str, Callable[[], str]]) -> str:
+    """A remedy: pages with a heading that has the word, else all."""
+    heading = re.compile(rf"^#.*{re.escape(word.removesuffix('s'))}", re.IGNORECASE | re.MULTILINE)
+    pages = [name for name, text in texts.items() if name != "settings" and heading.search(text())]
+    return f"see {', '.join(pages)}" if pages else f"give one of: {', '.join(sorted(texts))}"
+
+
 def run_help(args: argparse.Namespace, console: Console) -> int:
     """Print a page, an example, every setting, or a command's options."""
     roots = Path(__file__).parents[1:3]  # of a wheel, of the repository
@@ -48,7 +56,7 @@ def run_help(args: argparse.Namespace, console: Console) -> int:
     refuse_if(
         topic not in texts,
         f"help: no page {format_value(topic)}",
-        remedy=did_you_mean(topic, sorted(texts), f"give one of: {', '.join(sorted(texts))}"),
+        remedy=did_you_mean(topic, sorted(texts), _pages_about(topic, texts), cutoff=0.7),
         error=UsageError,
     )
     text = texts[topic]()

@@ -62,7 +62,7 @@ def _lines(result: Result) -> list[str]:
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
     return [
         *table(list(columns), [list(columns.values())]),
-        f"removed: {', '.join(reasons) or 'none'}",
+        f"splats removed: {', '.join(reasons) or 'none'}",
         f"computed on {', then '.join(map(describe_device, metrics['devices']))}",
     ]
 

@@ -340,10 +340,13 @@ REPLAY = (  # what people use, and in groups the rest
     option("--truth FILE", "truth.json of a simulated log", Path),
     option(
         "--evidence CAMERA|K",
-        "bound the map's error by held-out depth: of this camera, or (--lockstep) of every K-th frame set",
+        "bound the map's error by depth that is held out: this camera's, or with --lockstep every K-th frame set's",
     ),
     either(
-        option("--controller MODULE:CLASS", "judge this class, a policy at ws://HOST:PORT, or the one recorded"),
+        option(
+            "--controller MODULE:CLASS",
+            "this Python class, a policy at ws://HOST:PORT, or `recorded` commands",
+        ),
         option("--controller-command 'PROGRAM ARGS'", "or this program, by JSON on its stdin and stdout"),
     ),
     *output("folder to write", default="replay"),
@@ -433,7 +436,7 @@ AUDIT = (
     option("LOG", "a log, a capture, or an image folder's .toml; with joint states", Path),
     either(
         option("--urdf FILE", "the robot's URDF (default: the log's own)", Path),
-        option("--robot NAME", "or NAME.urdf of an installed Python package; an unknown name lists them"),
+        option("--robot NAME", "robot NAME.urdf of an installed Python package; an unknown name lists all"),
     ),
     option("--spheres FILE.yaml", f"its spheres ({FITTED})", Path),
     *PLACED,

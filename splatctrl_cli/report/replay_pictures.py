@@ -54,7 +54,7 @@ FIELD_STYLES: Mapping[str, tuple[str, Any, float]] = {  # colour, dashes, width
 }
 FIELD_NAMES = {
     "exact": "to the splats",
-    "barrier": "the controller's field",
+    "barrier": "by the controller's field",
     "certified": "certified bound",
     "truth": "truth",
 }

@@ -151,6 +151,7 @@ def test_help_prints_the_settings_and_names_the_nearest_page_for_a_wrong_word() 
     assert {each.returncode for each in done} == {0} and "--intrinsics" in info
     assert shown.split("[scene]\n", 1)[1].strip() == template.split("[scene]\n", 1)[1].strip()
     assert_refused(splatctrl("help", "replays"), 2, "splatctrl: help: no page 'replays'; did you mean replay?\n")
+    assert_refused(splatctrl("help", "margins"), 2, "splatctrl: help: no page 'margins'; see robot\n")
 
 
 def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:

@@ -199,7 +199,7 @@ def audits(older: Path, tmp_path: Path) -> tuple[Path, Path]:
 def test_a_regression_exits_with_1_and_is_a_failure_in_junit(audits: tuple[Path, Path], tmp_path: Path) -> None:
     told = splatctrl("compare", *audits, "--junit", tmp_path / "j.xml")
     assert told.returncode == 1 and told.stdout.startswith("compare: REGRESSION (")
-    words = "min_clearance: worse went from 0.0158572 to 0.001 m (0.0149 worse, allowed 0.001) at 0.92 s"
+    words = "min_clearance: from 0.0158572 to 0.001 m in worse (0.0149 worse, allowed 0.001) at 0.92 s"
     assert words in told.stdout
     lines = {line.split()[0]: line for line in told.stdout.splitlines()[4:] if line}
     assert "0.92 s, state 46, hand[11] near unrepresented voxel" in lines["min_clearance"]

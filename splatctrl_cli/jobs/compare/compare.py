@@ -72,9 +72,9 @@ class FigureChange:
     def sentence(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         if self.after is None:
-            return f"{self.recording} had {self.before:.6g}{unit} and has no value any more"
+            return f"from {self.before:.6g}{unit} to no value in {self.recording}"
         off = abs(self.after - self.before)
-        words = f"{self.recording} went from {self.before:.6g} to {self.after:.6g}{unit}"
+        words = f"from {self.before:.6g} to {self.after:.6g}{unit} in {self.recording}"
         return f"{words} ({off:.3g} {self.change}, allowed {self.allowed:.3g})"
 
 

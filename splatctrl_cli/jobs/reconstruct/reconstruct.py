@@ -279,5 +279,5 @@ def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> lis
         and (item.camera, item.stamp_ns) in chosen
         and arm.posture(item.stamp_ns) is not None
     ]
-    progress.log(f"the robot is measured in {plural(len(frames), 'frame')} of {plural(len(order), 'moment')}")
+    progress.log(f"compares the robot with depth in {plural(len(frames), 'frame')} of {plural(len(order), 'moment')}")
     return frames

@@ -116,6 +116,13 @@ PROOF = Bound(
     say="space not seen free within the allowed age is {mm} from the arm, margin {allowed_mm}",
     remedy="add cameras until they see every side of the arm",
 )
+OCCUPIED_PROOF = replace(
+    PROOF,
+    outcome=Outcome.FAILED,
+    label=MARGIN,
+    say="space that no camera saw free within the allowed age is {mm} from the arm, margin {allowed_mm} "
+    "(an obstacle by --unseen occupied)",
+)
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
@@ -131,8 +138,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
                 sentence="expected evidence of the space near the arm, got none",
                 remedy="give a reconstruction as --scene",
             )
-        proof = replace(PROOF, outcome=Outcome.FAILED, label=MARGIN) if is_occupied else PROOF
-        yield from proof(judged)
+        yield from (OCCUPIED_PROOF if is_occupied else PROOF)(judged)
     if judged.metrics["unknown_share"] is None:
         yield not_evaluable(
             sentence="expected a record of the space that cameras saw, got none",
@@ -237,7 +243,7 @@ def calibration(judged: Judged) -> Iterator[Reason]:
         judged_links.items(), key=lambda row: abs(float(row[1]["median_mm"])), default=("", dict[str, Any]())
     )
     yield (
-        passed_reason(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        passed_reason(f"cameras see the robot within {mm(value)} of its joints", value, MISPLACED, "m", len(by_link))
         if value <= MISPLACED
         else not_evaluable(
             sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "

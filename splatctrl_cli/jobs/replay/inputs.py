@@ -153,13 +153,11 @@ def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[s
     if by_surface:
         links = ", ".join(dict.fromkeys(name.partition("[")[0] for name in by_surface))
         words["by_surface"] = (
-            f"spheres that keep less than the margin, as their links' surfaces keep it: {len(by_surface)} of {links}"
+            f"{len(by_surface)} spheres come within the margin, but their links' surfaces do not: of {links}"
         )
     if robot.surfaces is not None and robot.surfaces.fused:
         pairs = ", ".join(" and ".join(pair) for pair in robot.surfaces.fused)
-        words["fused"] = (
-            f"not judged whether they touch, for they overlap in every posture recorded or sampled: {pairs}"
-        )
+        words["fused"] = f"contact not judged of links that overlap in every recorded and sampled posture: {pairs}"
     return words
 
 
@@ -167,16 +165,16 @@ def _self_margin_words(robot: MeasuredRobot, pair_margins: Sequence[KeptMargin],
     each = ", ".join(
         f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_gap_words(pair)}" for pair in pair_margins
     )
-    judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
-    return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
+    judged = "" if robot.surfaces is None else "; contact is judged by surfaces"
+    return f"self-collision margin: {1e3 * config.self_margin:g} mm, but of pairs with near spheres {each}{judged}"
 
 
 def _gap_words(pair: KeptMargin) -> str:
     if pair.surface_gap is None:
         return ""
     if pair.surface_gap <= 0:
-        return " (their spheres do not tell when their surfaces meet)"
-    return f" (their surfaces then {1e3 * pair.surface_gap:.1f} mm)"
+        return " (surfaces may touch then)"
+    return f" (surfaces then {1e3 * pair.surface_gap:.1f} mm apart)"
 
 
 def coverage_words(model: RobotModel, config: ControlConfig) -> str:

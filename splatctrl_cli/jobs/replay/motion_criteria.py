@@ -263,7 +263,7 @@ VELOCITY, ACCELERATION = (
         at_most=1.0,
         tolerance=LIMIT_EXCEEDED - 1.0,
         say="{who} reaches {value:.2f} times its limit",
-        passed="at most {value:.2f} of the limit",
+        passed="at most {percent:.0f} % of the limit",
         remedy="check the stamps and units of the states, and the URDF's limits",
     )
     for name in ("velocity", "acceleration")

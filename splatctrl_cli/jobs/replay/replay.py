@@ -132,7 +132,7 @@ def _notes(judged: Judged) -> Iterator[str]:
         "map error not measured" if error is None or error.bound is None else f"map error {bound_words(error.bound)}"
     )
     if close := [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]:
-        yield f"{len(close)} fixed spheres stand within the margin of their surroundings"
+        yield f"{len(close)} fixed spheres within the margin of their surroundings are not judged"
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         yield f"{judged.replay.lead_in_s:.2f} s before the first map are left out"
     scene = judged.inputs.scene.figures()

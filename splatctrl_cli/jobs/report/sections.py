@@ -17,7 +17,7 @@ from splatctrl_cli.report.timeline import legend, timeline
 PASSED = "passed"
 WIDTH = 900  # pixels of a picture at most
 PICTURES = {  # captions by start of file name
-    "worst_": "a moment of least clearance: photo, and the arm's spheres as the replay had them",
+    "worst_": "a camera image at small clearance, with the arm as replayed",
     "clearance": "clearance over time",
     "evidence": "what the cameras knew of the space within the margin of the arm",
     "commands": "what the controller commanded",

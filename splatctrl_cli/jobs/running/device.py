@@ -89,7 +89,7 @@ def automatic(
         assert device.memory is not None
         refuse_if(needed > device.memory.available(), "too little memory is free on the card", error=DeviceError)
     except DeviceError as error:
-        progress.log(f"computes on cpu: {error}")
+        progress.log(f"computes on the CPU ({error})")
         return Device()
     progress.log(f"computes on {describe_device(device.as_dict())}")
     return device

@@ -149,7 +149,7 @@ def test_spheres_that_stick_out_of_a_drawn_link_into_the_margin_are_named(desk: 
     ball = (tuple((place @ [*arm.sphere_set.centers[mine][tips.argmax()][:2], tips.max() + 0.06, 1.0])[:3]), 0.05)
     assert desk.replay(*scene_of(desk, ball), "--mode", "closed-loop", "-q") == 0  # type: ignore[arg-type]
     told = about_of(desk)["by_surface"]
-    assert re.fullmatch(r"spheres that keep less than the margin, .* surfaces keep it: [1-9] of hand", told)
+    assert re.fullmatch(r"[1-9] spheres come within the margin, but their links' surfaces do not: of hand", told)
     assert desk.metrics()["num_relaxed"] == 0
     field = write_field(desk.folder / "field", ball)  # type: ignore[arg-type]
     assert desk.replay("--field", str(field), "--mode", "closed-loop", "-q", out="grid") == 0
@@ -194,8 +194,8 @@ def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
         assert len(lines) == said
     assert desk.replay(*drive, "--mode=closed-loop", *wide) == 0
     assert re.fullmatch(
-        "self-collision margin: 60 mm, or what spheres can keep: .*link5 and link7.*"
-        "whether links touch is judged by their surfaces",
+        "self-collision margin: 60 mm, but of pairs with near spheres .*link5 and link7.*"
+        "contact is judged by surfaces",
         about_of(desk)["self_margins"],
     )
 

@@ -263,7 +263,7 @@ def test_what_stands_at_the_mount_from_the_start_is_only_said(stage: Stage) -> N
     listed = stage.desk.json("events.json")["static_violations"]
     nearest = min(listed, key=lambda one: one["clearance"])
     assert nearest["clearance"] < 0 and nearest["sphere"].startswith("link0[")
-    assert any(f"{len(listed)} fixed spheres stand within the margin" in note for note in verdict["notes"])
+    assert any(f"{len(listed)} fixed spheres within the margin" in note for note in verdict["notes"])
 
 
 def test_what_is_seen_at_a_mount_for_the_first_time_did_not_come(stage: Stage) -> None:

@@ -207,11 +207,11 @@ def test_too_little_memory_is_refused_with_the_budget_that_fits(
 def test_auto_takes_a_card_where_its_work_is_worth_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, on_card: EmulatedDevice
 ) -> None:
-    assert "computes on cpu: 400 splats on 4800 pixels are too little work" in bench.reconstruct("small").err
+    assert "computes on the CPU (400 splats on 4800 pixels are too little work" in bench.reconstruct("small").err
     monkeypatch.setattr(device, "CARD_LEAST_WORK", 400 * 4800)
     assert "computes on cuda:0 (Card, driver 580.1)" in bench.reconstruct("large").err
     on_card.limit = 1_500_000
-    assert "computes on cpu: too little memory is free on the card" in bench.reconstruct("full").err
+    assert "computes on the CPU (too little memory is free on the card" in bench.reconstruct("full").err
     assert [bench.devices(name) for name in ("small", "large", "full")] == [["cpu"], ["cuda:0"], ["cpu"]]
 
 
@@ -236,7 +236,7 @@ def test_auto_goes_on_where_the_run_was(
     if not has_card:
         monkeypatch.setattr(device, "open_device", lack_card)
     said = bench.reconstruct("scene", "--resume")
-    assert (bench.devices("scene"), "computes on cpu: no NVIDIA driver" in said.err) == (ends, not has_card)
+    assert (bench.devices("scene"), "computes on the CPU (no NVIDIA driver" in said.err) == (ends, not has_card)
 
 
 REFUSED = {
