@@ -75,7 +75,7 @@ class Stopping(Protocol):
 class Deceleration:
     """A stop on the path: the fastest sphere slows by `deceleration` [m/s^2], the declared worst case.
 
-    T_s = v / a and S_s = v^2 / (2 a) for that sphere; each other one travels in proportion to its speed.
+    T_s = v / a and S_s = v^2 / (2 a) for that sphere; each other sphere travels in proportion to its speed.
     """
 
     deceleration: float
@@ -88,7 +88,7 @@ class Deceleration:
 
 @dataclass(frozen=True, kw_only=True)
 class StopRow:
-    """Declared stops of one axis at an extension and payload, as shares of the largest.
+    """Declared stops of one axis at an extension and payload, both shares of the largest.
 
     speed (K,): shares of the axis's limit, rising to 1; time (K,) [s], distance (K,) [rad or m].
     """
@@ -103,8 +103,8 @@ class StopRow:
     def at(self, share: Float64) -> tuple[Float64, Float64]:
         """Time (T,) and distance (T,) at shares (T,) of the speed limit.
 
-        Distances are linear between the rows, which exceeds v^2. Times are at least the first row's. Past the limit
-        they grow with v and v^2.
+        Distances are linear between declared speeds, which overestimates v^2. Times are at least the first one, or 0
+        at standstill. Above the limit, times grow with v and distances with v^2.
         """
         over = np.maximum(share, 1.0)
         time = np.where(share > STANDING, np.interp(share, self.speed, self.time), 0.0)
@@ -115,7 +115,7 @@ class StopRow:
 class StopTable:
     """Declared stops by joint, rows by rising extension; the next larger extension counts.
 
-    A sphere's travel adds those of all axes, each on its circle: their stops need not keep the path.
+    A sphere's travel is the sum of its arcs about all axes, because axes that stop independently leave the path.
     """
 
     rows: Sequence[Sequence[StopRow]]
@@ -134,7 +134,7 @@ class StopTable:
 
 @dataclass(frozen=True, kw_only=True)
 class Travel:
-    """Motion until the arm stands: person (T,), reaction and stopping (T, M) [m], which is S_h, S_r and S_s."""
+    """Motion until the arm stands: person S_h (T,), reaction S_r and stopping S_s (T, M) [m]."""
 
     person: Float64
     reaction: Float64
@@ -163,7 +163,7 @@ class Approach:
         )
 
     def speed_scale(self, motion: ArmMotion, room: Float64) -> Float64:
-        """Largest scales (T,) at which no sphere travels more than its room (T, M) [m]; else 0."""
+        """Largest scales (T,) at which no sphere's `travel` exceeds its room (T, M) [m]; else 0."""
         scale = np.zeros(len(room))
         for step in (1.0, *(0.5**k for k in range(1, SCALE_STEPS + 1))):
             tried = np.minimum(scale + step, 1.0)
@@ -219,7 +219,7 @@ class DeclaredSeparation:
     stops: tuple[StopRow, ...] = field(default=())
 
     def stopping(self, axes: Sequence[str]) -> Stopping:
-        """The arm's stops; a table's rows are those of the next larger payload."""
+        """The arm's stops; in a table, the rows of the next larger payload count."""
         if self.deceleration is not None:
             return Deceleration(deceleration=self.deceleration)
         payloads = sorted({row.payload for row in self.stops})
@@ -232,8 +232,8 @@ def read_separation(path: Path, axes: Sequence[str]) -> DeclaredSeparation:
     """Read the declared inputs.
 
     axes: the robot's joints; a stop table must have all.
-    Raises InputError for a missing file; UsageError for other text than TOML, an unknown or missing key, a value out
-    of range, or a stop table that is incomplete or falls with the speed.
+    Raises InputError for a missing file; UsageError for text that is not TOML, an unknown or missing key, or a value
+    out of range. A stop table must be complete, and its values must rise with the speed.
     """
     faults = (tomllib.TOMLDecodeError, UnicodeDecodeError)
     with refuse_faults(f"{path}: not valid TOML", *faults, remedy=REMEDY, error=UsageError):
