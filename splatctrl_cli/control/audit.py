@@ -1,7 +1,7 @@
 """Clearance of logged joint states by each field, their unknown share, and bounds between states.
 
-Between two states with distances d_0s and d_1s, sphere s travels at most L_s. Because exact distance is 1-Lipschitz,
-its distance there is at least ``(d_0s + d_1s - L_s) / 2``. L_s follows from joint motion and `RobotModel.lever_arms`.
+Between states with distances d_0s and d_1s, sphere s travels at most L_s, joint motion times `RobotModel.lever_arms`.
+Exact distance is 1-Lipschitz, and thus at least ``(d_0s + d_1s - L_s) / 2`` in between.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +21,7 @@ DistanceFunction = Callable[[Float64], Float64]
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` to the surfaces of balls: centers (N, 3), radii (N,) [m]."""
+    """A `DistanceFunction` to balls: centers (N, 3), radii (N,) [m]."""
 
     of_points: DistanceFunction
     centers: Floats
@@ -44,7 +44,7 @@ CHUNK = 256  # states per query
 class Clearance(Columns):
     """Distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
 
-    For self-collision, both are of the nearest pair of spheres: inf and -1 without pairs.
+    For self-collision, both are of the nearest pair; inf and -1 without pairs.
     """
 
     distance: Float64
@@ -53,12 +53,11 @@ class Clearance(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class AuditTrace:
-    """T audited states.
+    """T audited states, with values (T,).
 
-    stamp_ns (T,); position (T, J) [rad]; clearance: by field; limit_margin (T,) [rad]: to the nearest position limit,
-    that of limit_joint (T,), negative outside; self_clearance (T,) [m]: of self_pair (T,), inf without pairs;
-    unknown_share (T,): share of moving spheres' centres never seen, NaN if not measured; of_spheres: clearances
-    (T, M) [m] of moving spheres, by field.
+    position (T, J) [rad]; clearance: by field; limit_margin [rad]: to the nearest position limit, of limit_joint,
+    negative outside; self_clearance [m]: of self_pair, inf without pairs; unknown_share: never-seen share of sphere
+    centres (NaN: not measured); of_spheres: clearances (T, M) [m] by field.
     """
 
     stamp_ns: Stamps
@@ -77,9 +76,8 @@ def part_clearances(
 ) -> tuple[Float64, Bool]:
     """Moving parts' clearances (T, M) [m] at postures (T, J); True (M,) for link surfaces.
 
-    In a scene of balls, a link's triangles decide: the link's nearest sphere gets the triangles' clearance. Its other
-    spheres get at least that clearance, or their own less `sphere_deficit` if larger. centers (T, S, 3) [m]: of all
-    spheres, if known.
+    In a scene of balls, a link's triangles decide: its nearest sphere gets their clearance. Its other spheres get the
+    larger of that clearance and their own less `sphere_deficit`. centers (T, S, 3) [m]: of all spheres, if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers
@@ -103,7 +101,7 @@ def part_clearances(
 def moving_clearance(
     model: RobotModel, positions: Float64, distance_to: DistanceFunction, centers: Float64 | None = None
 ) -> tuple[Clearance, Float64]:
-    """Least of `part_clearances` (T,), and all of them (T, M) [m]."""
+    """Least of `part_clearances` (T,), and all (T, M) [m]."""
     distance, _ = part_clearances(model, positions, distance_to, centers)
     moving = np.flatnonzero(model.moving_spheres)
     nearest = np.argmin(distance, axis=1)
@@ -184,10 +182,10 @@ def _unknown_share(model: RobotModel, centers: Float64, observed: Observed | Non
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """Moving spheres (M,) of an arm, and bounds on their travel.
+    """Moving spheres (M,) of an arm and their travel.
 
-    radii (M,) [m]: enlarged to cover the link's surface; levers (M, J): most travel [m] per rad or m of a joint;
-    velocity_limit (J,) [rad/s or m/s].
+    radii (M,) [m]: enlarged to cover the surface; levers (M, J): travel [m] per rad or m of a joint; velocity_limit
+    (J,) [1/s].
     """
 
     moving: Integers
@@ -234,10 +232,10 @@ def between_states(
 ) -> Between:
     """Bound clearances between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. In intervals up to `longest`
-    [s] the arm moves straight in joint space, plus any travel of its velocities (T, J) beyond that motion. In longer
-    intervals it may move anywhere within its velocity limits. They have a bound only if it reaches the margin [m], or
-    if an end is below the margin.
+    at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
+    moves straight in joint space, plus any travel of its velocities (T, J) beyond that motion. Over longer intervals
+    it may move anywhere within its velocity limits; that bound counts only if it reaches the margin [m], or if an end
+    is below the margin.
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))

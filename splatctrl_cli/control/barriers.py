@@ -21,7 +21,7 @@ MARGIN = "margin"
 class SceneRows(BarrierTerm):
     """A row per moving sphere against a distance field's nearest surface.
 
-    For spheres in `State.by_surface`, the distance of their link's surface counts where it is larger.
+    Spheres in `State.by_surface` take their link's surface distance where that is larger.
     """
 
     kind = RowKind.SCENE
@@ -48,7 +48,7 @@ class SceneRows(BarrierTerm):
     def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
         """Distances (M,) [m], those of `chosen` (M,) spheres raised to their link's surface gap.
 
-        In G (M, J), the rows of raised spheres become minus the gap's gradient, in place.
+        Rows G (M, J) of raised spheres become minus the gap's gradient, in place.
         """
         if self._balls is None or not chosen.any():
             return distance
@@ -63,7 +63,6 @@ class SceneRows(BarrierTerm):
         return distance
 
     def rows(self, state: State) -> Barrier:
-        """Rows, by one query of distance and gradient."""
         centers, jacobians = state.spheres
         distance, gradient = self._query(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
@@ -74,8 +73,8 @@ class SceneRows(BarrierTerm):
     def cut(self, state: State, velocity: Float64, chosen: Integers, distance: Float64) -> Barrier:
         """Rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
 
-        The distance is linearised at the end of the period. This is conservative for a surface convex as seen from
-        there, such as a ball. At the state, it counts as at least the present `distance` (M,).
+        The distance is linearised at the period's end: conservative for a surface convex as seen from there, such as
+        a ball. At the state, it counts as at least the present `distance` (M,).
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -89,7 +88,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """Distances (M,) [m]; NaN where unknown, which fails the check after a step."""
+        """Distances (M,) [m]; NaN where unknown, which fails a step's check."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: Integers, G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -126,7 +125,7 @@ class SelfRows(BarrierTerm):
     def rows(self, state: State) -> Barrier:
         """Rows of the pairs.
 
-        If joints stop at once, G is zero for pairs that are too slow to violate their row.
+        If joints stop at once, G is zero for pairs too slow to violate their row.
         """
         centers, jacobians = state.spheres
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
@@ -163,7 +162,7 @@ class SelfRows(BarrierTerm):
 def scene_margin(model: RobotModel, config: ControlConfig) -> Float64:
     """Spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
-    By the triangle inequality, the link's surface then stays epsilon away, for any 1-Lipschitz distance.
+    By the triangle inequality, the surface then stays epsilon away, for any 1-Lipschitz distance.
     """
     deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
     return config.margin + deficit
@@ -177,10 +176,10 @@ def distance_bound(
     G: Float64,
     rate: float | Float64 = 0.0,
 ) -> Float64:
-    """h (M,) [m/s], which leaves room for braking if joints have an acceleration limit.
+    """h (M,) [m/s], with room for braking if joints have an acceleration limit a (J,).
 
-    G (M, J) counts only with such a limit a (J,). It can brake a row's approach G v by at most ``|G| a``, of which
-    BRAKING_SHARE is used. rate [m/s]: dd/dt of a changing field.
+    Only then G (M, J) counts: a row's approach G v can be braked by at most ``|G| a``, of which BRAKING_SHARE is
+    used. rate [m/s]: dd/dt of a changing field.
     """
     if acceleration is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
@@ -233,7 +232,7 @@ SceneStepAt = Callable[[int], SceneStep | None]
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
     """Rate dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    The rate is clipped to [-limit, 0]; missing distances give 0. It is assumed to continue until the next scene.
+    It is clipped to [-limit, 0], 0 for missing distances, and assumed to last until the next scene.
     """
     if step is None:
         return 0.0
@@ -244,7 +243,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 def rate_of(
     config: ControlConfig, model: RobotModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
-    """Rate dd/dt [m/s] of the moving spheres' distances at a posture (J,), 0 unless configured."""
+    """Rate dd/dt [m/s] of the moving spheres at a posture (J,), 0 unless configured."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
     if step is None:
         return 0.0
@@ -255,7 +254,7 @@ def rate_of(
 class PeopleGrown:
     """A scene's field in which people extend `extra` [m] farther.
 
-    The distance is min(scene, people - extra), the gradient that of the smaller term.
+    Distance min(scene, people - extra), with the smaller term's gradient.
     """
 
     def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:
@@ -274,7 +273,7 @@ class PeopleGrown:
 def guard_people(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
     """Field from which a controller keeps `config.margin`.
 
-    In it, people are nearer by `config.human_margin` less the margin.
+    People are nearer by `config.human_margin` less the margin.
     """
     extra = config.human_margin - config.margin
     return scene if people is None or extra <= 0 else PeopleGrown(scene, people, extra)

@@ -59,8 +59,8 @@ def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedC
     """Columns of a controller's steps; None is a state without a step.
 
     v (T, J) [rad/s]: velocity. rung_number: index in RUNGS. position_error [m], rotation_error [rad]. shaped:
-    `is_shaped`, NaN for an external controller. multiplier_*: largest of a kind. who_*: rows of that kind, by falling
-    multiplier; who_relaxed: by falling slack.
+    `is_shaped`, NaN for an external controller. multiplier_*: largest of a kind. who_*: rows, by falling multiplier;
+    who_relaxed: by falling slack.
     """
 
     def number(value: Callable[[ControlStep], float]) -> Float64:
@@ -155,8 +155,8 @@ SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events,
 class Obstacle:
     """Nearest obstacle: distance [m] from a point to its surface; position (3,) [m], world.
 
-    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: index in a grid; name: of an
-    obstacle that is neither.
+    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: in a grid; name: of any other
+    obstacle.
     """
 
     distance: float
@@ -177,8 +177,8 @@ class Obstacle:
 class Event:
     """An interval of successive states with its worst value.
 
-    names: in order of appearance, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the
-    state with the worst value; worst_name, obstacle: at that state.
+    names: in order, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the worst value's
+    state; worst_name, obstacle: at that state.
     """
 
     kind: EventKind
@@ -201,7 +201,7 @@ class Event:
 class Signal:
     """Source of events of one kind, by state: is_on (T,), value (T,), who (T,).
 
-    who: the name that belongs to the value, or names that begin with it.
+    who: the value's name, or names, the value's first.
     """
 
     kind: EventKind
@@ -228,14 +228,13 @@ Near = Callable[[EventKind, str, int], Obstacle | None]
 
 
 def events_of(stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> tuple[Event, ...]:
-    """Events of all signals (T,), ordered by start; near: finds the obstacle of a worst value."""
+    """Events of all signals (T,), by start; near: finds the obstacle of a worst value."""
     runs = [(signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
     runs.sort(key=lambda run: (stamp_ns[run[1]], -stamp_ns[run[2] - 1]))
     return tuple(_event(stamp_ns, signal, first, end, near) for signal, first, end in runs)
 
 
 def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> Event:
-    """The event of the states [first, end)."""
     values = signal.value[first:end]
     at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
     start_s, end_s, worst_s = (float(stamp_ns[i] - stamp_ns[0]) * 1e-9 for i in (first, end - 1, at))

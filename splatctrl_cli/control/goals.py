@@ -54,7 +54,7 @@ def _cap(vector: Float64, limit: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedMotion:
-    """T logged states: stamp_ns (T,) that never go back; position (T, J) [rad], velocity (T, J) [rad/s]."""
+    """T logged states: stamp_ns (T,) that never go back; position, velocity (T, J) [rad, rad/s]."""
 
     stamp_ns: Stamps
     position: FloatRows
@@ -67,7 +67,7 @@ class LoggedMotion:
     def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
         """Position and velocity (J,) at a stamp, linear between states.
 
-        Before the first state, that state counts. After the last one, its position counts, at rest.
+        Earlier stamps give the first state, later stamps the last position at rest.
         """
         if stamp_ns > self.last_ns:
             return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
@@ -83,7 +83,7 @@ class LoggedMotion:
 
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
-    """Pose (4, 4) of a frame, and its `Guide`, at a posture (J,) and velocity (J,)."""
+    """Pose (4, 4) of a frame, and its `Guide`, at a posture and velocity (J,)."""
     return model.frame_pose(position, frame), Guide(
         twist=model.frame_jacobian(position, frame) @ velocity, posture=position, velocity=velocity
     )
@@ -91,10 +91,10 @@ def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Floa
 
 @dataclass(frozen=True, kw_only=True)
 class TimedPath:
-    """A timed path, at rest at each waypoint (W, J) so that its edges are straight.
+    """A timed path, at rest at each waypoint (W, J) to keep its edges straight.
 
-    start_time (W,) [s]: of each edge, and the end. top_speed [1/s], acceleration [1/s^2] (W - 1,): trapezoidal speed
-    of the share of an edge.
+    start_time (W,) [s]: of each edge, and the end. top_speed [1/s], acceleration [1/s^2] (W - 1,): of a trapezoidal
+    speed, as shares of the edge.
     """
 
     waypoints: Float64
@@ -140,7 +140,7 @@ class Detour:
         return guided_goal(model, frame, position[0], velocity[0])
 
     def advance(self, seconds: float, pose_error: Float64) -> None:
-        """Advance the clock, unless the pose error (6,) reaches `wait_distance`."""
+        """Advance the clock if the position part of pose_error (6,) is below `wait_distance`."""
         if float(np.linalg.norm(pose_error[:3])) < self.wait_distance:
             self.clock = min(self.clock + seconds, self.path.duration)
 
@@ -192,7 +192,7 @@ class TwistTrack:
     def goal_at(
         self, model: RobotModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
-        """Goal: the frame's present pose (4, 4), moving with the twist; the posture stays q (J,)."""
+        """Goal: the frame's present pose (4, 4), moving with the twist; posture q (J,)."""
         return model.frame_pose(q, frame), Guide(
             twist=self.reference(model, config, q, stamp_ns), posture=q, velocity=np.zeros(len(q))
         )

@@ -40,7 +40,7 @@ class Misbehaved(Exception):  # noqa: N818  (a result, kept by name)
 
 
 class LineProcess:
-    """A process that answers line by line; lines and stored stderr are bounded in size."""
+    """A process that answers line by line, with bounded lines and stored stderr."""
 
     def __init__(self, command: Sequence[str]) -> None:
         """Raises OSError if it cannot start."""
@@ -60,7 +60,7 @@ class LineProcess:
     def exchange(self, line: bytes, limit: float) -> bytes:
         """Send a line and return the next one.
 
-        Raises Misbehaved if no line comes within `limit` [s], if it is endless, or if the process ends.
+        Raises Misbehaved without a line within `limit` [s], for an endless line, or if the process ends.
         """
         deadline = time.monotonic() + limit
         if not self._unsent:

@@ -1,6 +1,6 @@
 """Camera evidence near a moving arm: each point within the margin has one class.
 
-The points form a lattice outside the robot, near the triangles of its moving links, or spheres without triangles.
+The points form a lattice outside the robot, near its moving links' triangles, or a link's spheres if it has none.
 """
 
 from collections.abc import Callable
@@ -26,10 +26,9 @@ NEVER_SEEN = (
 class Seen:
     """Camera evidence at one moment.
 
-    look: points (Q, 3) [m], world -> stamps and classes. A stamp (Q,) [ns] is of the last depth through or on the
-    point, -1 if never. A class is an `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and
-    radius of balls into which a surface may extend. origin (3,), voxel [m], shape (X, Y, Z): of the voxel grid.
-    is_free (X, Y, Z): True for voxels that are free now (None: unknown).
+    look: points (Q, 3) [m], world -> stamp (Q,) [ns] of the last depth through or on each point, -1 if never, and its
+    `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
+    surface may extend. origin (3,), voxel [m], shape (X, Y, Z): of the voxels. is_free (X, Y, Z): None if unknown.
     """
 
     look: Callable[[Float64], tuple[Index, UInt8]]
@@ -44,13 +43,12 @@ class Seen:
 class Account:
     """Evidence near the arm in one posture.
 
-    shares (C,): of points within the margin, by `EvidenceClass`. assumed: share of points that are not free, among
-    those whose voxels reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places
-    (C, 3). unseen_path [m]: length of the shortest path from the map's surfaces to the arm through a never-seen
-    point, unseen_path_place. blind_to_surface [m]: least distance from the surfaces to a never-seen point,
-    blind_place, near a sphere with almost only such points (`NEAR_BLIND`). Without such points, distances are
-    infinite, places NaN. age [s]: quantile `NEAR_FRESH_SHARE` of ages. ahead [s]: from the state to the latest view.
-    Both are NaN without views.
+    shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
+    reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
+    unseen_path [m]: shortest path from the map's surfaces to the arm through a never-seen point, unseen_path_place.
+    blind_to_surface [m]: least distance from the surfaces to a never-seen point, blind_place, near a sphere with
+    almost only such points (`NEAR_BLIND`). Without such points, distances are infinite, places NaN. age [s]: quantile
+    `NEAR_FRESH_SHARE` of ages. ahead [s]: time until the latest view. Both are NaN without views.
     """
 
     shares: Float64
@@ -66,7 +64,7 @@ class Account:
 
 
 class NearSpace:
-    """Evaluates states of a motion that are far enough apart in time or space."""
+    """Evaluates states of a motion that are far enough apart."""
 
     def __init__(self, model: RobotModel, margin: float, max_age: float = np.inf) -> None:
         """max_age [s]: older evidence is stale."""
@@ -81,10 +79,10 @@ class NearSpace:
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
     def choose(self, stamps: Index, centers: Float64) -> dict[int, bool]:
-        """Indices of states to evaluate; True if the age of their evidence counts.
+        """Indices of states to evaluate; True if the evidence's age counts.
 
-        A state is chosen every `NEAR_EVERY_NS` (True), and whenever a sphere has moved by `NEAR_MOVED` (False).
-        stamps (T,) [ns] never go back; centers (T, S, 3).
+        A state is chosen every `NEAR_EVERY_NS` (True), and when a sphere has moved by `NEAR_MOVED`. stamps (T,) [ns]
+        never go back; centers (T, S, 3).
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
         for index, stamp_ns in enumerate(stamps.tolist()):
@@ -97,7 +95,7 @@ class NearSpace:
         return chosen
 
     def postures_between(self, first: Float64, last: Float64) -> Float64:
-        """Postures (K, J) between two, so dense that no sphere moves over `NEAR_MOVED` between neighbours."""
+        """Postures (K, J) between two, so dense that no sphere moves over `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))
         return np.asarray(first + (last - first) * (np.arange(1, num) / max(num, 1))[:, None])
@@ -156,7 +154,7 @@ class NearSpace:
         return np.asarray(origin + step * (first + np.argwhere(is_near)))
 
     def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
-        """Distance (Q,) [m] to moving links, infinite beyond `reach`, negative inside any; nearest moving sphere."""
+        """Distance (Q,) [m] to moving links, infinite beyond `reach`, negative inside; nearest moving sphere."""
         to_spheres = cdist(points, centers) - self._radii
         gaps = np.full(len(points), np.inf)
         is_inside = np.zeros(len(points), bool)

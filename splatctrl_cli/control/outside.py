@@ -84,7 +84,7 @@ class Program(LineProcess):
     """A controller process (docs/controllers.md)."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
-        """Start the process and send `start`. Raises InputError if it is no controller."""
+        """Start the process and send `start`. Raises InputError if it fails or is no controller."""
         self.clock, self._num = StepClock(step_limit), 0
         with refuse_faults(
             lambda error: f"{name}: cannot be started: {getattr(error, 'strerror', None) or error}",
@@ -110,7 +110,7 @@ class Program(LineProcess):
     def velocity(
         self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
     ) -> Float64:
-        """Velocities (J,) [rad/s] of the answer, sending rows on request. Raises Misbehaved.
+        """Answered velocities (J,) [rad/s], sending rows on request. Raises Misbehaved.
 
         limits [rad/s]: by joint.
         """
@@ -140,7 +140,7 @@ class RecordedCommands:
         return checked_velocity({"velocity": self._commands[newest].tolist()}, limits)
 
     def close(self) -> None:
-        """Do nothing; the commands are in memory."""
+        """Do nothing."""
 
 
 class OutsideController(Commander, AbstractContextManager["OutsideController"]):
@@ -160,10 +160,7 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         home: Float64 | None = None,
         is_twice: bool = False,
     ) -> None:
-        """name: for messages; frame, home: as for `QpIkController`; is_twice: compare two instances.
-
-        Raises InputError if the controller cannot start.
-        """
+        """name: for messages; frame, home: as for `QpIkController`. Raises InputError if it cannot start."""
         self.name, self.num_answers, self.seconds, self.slowest = name, 0, 0.0, 0.0
         self.failure: Failure | None = None
         self._model, self._frame = model, frame
@@ -258,7 +255,7 @@ def _question(model: RobotModel, frame: str, moment: Moment, view: View) -> Docu
 
 
 def _rows(controller: QpIkController, view: View) -> list[Document]:
-    """Scene rows, and rows of pairs in the program; see `ClearanceRow`."""
+    """Rows of the scene, and of pairs in the program; see `ClearanceRow`."""
     rows, kinds = view.rows, controller.row_kinds
     G = np.concatenate([barrier.G for barrier in rows.barriers])
     h, distance = rows.h, rows.distance
@@ -301,7 +298,7 @@ def _document(line: bytes) -> Document:
 def checked_velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
     """Velocities (J,) [rad/s] of an answer; limits: by joint.
 
-    Raises Misbehaved for a wrong number of them, or a value not finite or over MAX_SPEED limits.
+    Raises Misbehaved for a wrong length, or values not finite or above MAX_SPEED limits.
     """
     values = answer.get("velocity")
     if not isinstance(values, list) or len(values) != len(limits) or any(type(v) not in (int, float) for v in values):

@@ -25,11 +25,11 @@ NUMBERS = "fiub"  # kinds of arrays
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyAddress:
-    """A server's URL without its query, and what the query asks for.
+    """A server's URL without its query, and the query.
 
     observed: an observation's values by key, empty for the joints and all images. A value is `JOINTS`, `IMAGE` and a
-    camera, or text. actions: joint `VELOCITY` [rad/s] or `POSITION` [rad]. horizon: number of a chunk's actions to
-    execute, 0 for all.
+    camera, or text. actions: joint `VELOCITY` [rad/s] or `POSITION` [rad]; horizon: actions of a chunk to execute, 0
+    for all.
     """
 
     url: str
@@ -68,7 +68,7 @@ def parse_address(text: str) -> PolicyAddress:
 
 
 class RecordedImages:
-    """Newest recorded colour image of each camera, as a policy's observation needs them."""
+    """Newest recorded colour image of each camera."""
 
     def __init__(self, cameras: Iterable[str], frames: Iterable[RgbdFrame]) -> None:
         """frames: by rising stamp."""

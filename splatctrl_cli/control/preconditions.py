@@ -110,7 +110,7 @@ def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
 def static_violations(
     model: RobotModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
-    """Fixed spheres nearer to the scene than the margin [m], one or (S,): mounting, not control."""
+    """Fixed spheres nearer to the scene than the margin [m], one or (S,), due to mounting."""
     if np.all(model.moving_spheres):
         return ()
     still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
@@ -137,9 +137,9 @@ class FixedParts:
     """First clearance of each fixed sphere, and the least with obstacles that arrived later.
 
     clearances: both [m], by sphere. A ball has arrived if it is over STATIC_CHANGE (MOUNTED_CHANGE near a mount) from
-    all balls of the first scene, and nearer than the first clearance by as much. The scene before must show it, too,
-    and its voxel was free in an earlier scene; otherwise it fills a hole of the map. A link's triangles count where
-    they are farther away.
+    all balls of the first scene, and nearer than the first clearance by as much. The last scene had it, too, and its
+    voxel was free in an earlier one; else it fills a hole of the map. A link's triangles count where they are
+    farther.
     """
 
     def __init__(self, model: RobotModel, near: float) -> None:
@@ -174,10 +174,7 @@ class FixedParts:
     def _came(
         self, balls: BallDistance, centers: Float64, q: Float64, was_free: WasFree | None, change: Float64
     ) -> Float64:
-        """Clearance (M,) [m] of each sphere from balls that arrived, infinite without any.
-
-        change (M,) [m]: least distance of an arrival from earlier balls.
-        """
+        """Clearance (M,) [m] of each sphere from balls that arrived, by its `change` (M,) [m]; else infinite."""
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii

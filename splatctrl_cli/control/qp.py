@@ -158,7 +158,7 @@ class Choice:
     """The fallback ladder's answer.
 
     velocity (J,); slack (M,) of barrier rows; multipliers of the box (2 J,) and barrier rows (M,); solution: the
-    last one computed; num_refused: number of programs with slacks without a usable solution.
+    last one computed; num_refused: number of unusable solutions with slacks.
     """
 
     velocity: Float64
@@ -185,7 +185,7 @@ def descend(
     """Solve the program, else minimise the rows' violation, else stand still.
 
     The program without slacks is solved first. Its solution counts if no multiplier exceeds its row's slack cost.
-    Otherwise rows get slacks, which always makes the program feasible. The rung is RELAXED if a slack remains.
+    Else rows get slacks, which always makes it feasible. RELAXED means that a slack remains.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver(assemble_hard(costs, *box, barriers))
@@ -219,7 +219,6 @@ def descend(
 
 
 def stand_still(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
-    """A standstill: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
         rung=Rung.HOLD,
@@ -237,7 +236,7 @@ def assemble_hard(
     """Program over v alone, which may be infeasible.
 
     Rows: upper, lower box limits (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, the solution
-    is that of `assemble`, too: an L1 penalty above the multipliers is exact.
+    solves `assemble`, too: an L1 penalty above the multipliers is exact.
     """
     H, c = sum_costs(costs)
     G, h = box_rows(lowest, highest)

@@ -23,9 +23,9 @@ from splatctrl_cli.robot.model import RobotModel
 class Rows:
     """All M rows at one configuration, and the subset that the QP needs.
 
-    barriers: one per term, first moving spheres, then pairs. margin (M,) [m]. is_fixed (M,): no joint velocity
-    changes the row. in_qp (M,): the row is not fixed, and some velocity of the box violates it. cuts: further QP rows
-    (`RowBuilder.cut`), each with the index of its scene row.
+    barriers: one per term, first moving spheres, then pairs. margin (M,) [m]. is_fixed: no joint velocity changes the
+    row. in_qp: it is not fixed, and some velocity of the box violates it. cuts: further QP rows (`RowBuilder.cut`),
+    each with its scene row's index.
     """
 
     barriers: tuple[Barrier, ...]
@@ -57,7 +57,7 @@ class Rows:
         return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """Values of the QP's rows as (M,), zero for others; cuts raise their row's."""
+        """Values of all rows (M,): zero outside the QP, the largest where a row has cuts."""
         everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
         everywhere[self.in_qp] = values[:num_rows]
         if self.cuts is not None:
@@ -66,7 +66,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds an arm's rows in a distance field; names, kinds (M,); scene: the field's term."""
+    """Builds an arm's rows in a distance field; names, kinds (M,); scene: its `SceneRows`."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class RowBuilder:
         return (self.scene, *self._others)
 
     def replace_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
-        """Rows in another field; see `SceneRows.replace_field`."""
+        """Rows in another field (`SceneRows.replace_field`)."""
         other = copy(self)
         other.scene = self.scene.replace_field(field, balls)
         return other

@@ -1,4 +1,4 @@
-"""Open loop along a log, closed loop to a goal, with each time's scene."""
+"""Open loop along a log, closed loop to a goal, in each stamp's scene."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,9 +47,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: posture to lean to (None: the model's `middle`). via: poses to reach first, in order. follow:
-    motion whose pose at each time is the goal, until the log ends. twists: velocities to reach instead of poses,
-    until end_ns. anchors: motion into whose posture the arm is put back every anchor_period [s].
+    home (J,) [rad]: posture to lean to (None: `model.middle`). via: poses to reach first, in order. follow:
+    motion whose pose at each time is the goal, until it ends. twists: velocities to reach instead of poses, until
+    end_ns. anchors: motion into whose posture the arm is put back every anchor_period [s].
     """
 
     start: Float64
@@ -66,7 +66,7 @@ class ReplayTask:
 
     @property
     def last_ns(self) -> int | None:
-        """Last stamp; None where the task ends at a goal."""
+        """Last stamp; None if the task ends at a goal."""
         if self.twists is not None:
             return self.end_ns
         return None if self.follow is None else self.follow.last_ns
@@ -76,8 +76,8 @@ class ReplayTask:
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: steps before which the arm was put back into the log; num_reached: number of goals; detours: steps after
-    which a planned detour began; by_surface: spheres that counted by their link's surface at the end.
+    anchored: steps before which the arm was put back; num_reached: number of goals; detours: steps after which a
+    planned detour began; by_surface: spheres that counted by their link's surface at the end.
     """
 
     stamp_ns: Stamps
@@ -107,10 +107,10 @@ def closed_loop(
     """Integrate the commander's velocities at `config.period` until goal, stall or `config.max_time`.
 
     field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
-    plan_detour: finds a path out of a stall, up to `config.max_detours` times; record: file of steps (None: memory);
-    distance_to: for `check_free`; balls_at: the field's balls at a stamp, None where links' surfaces do not count.
-    Raises InputError for a start outside the limits or an unreachable goal, NotEvaluableError for a start in
-    collision or outside the field.
+    plan_detour: path out of a stall, up to `config.max_detours` times; record: of steps (None: in memory);
+    distance_to: for `check_free`; balls_at: the field's balls, None where links' surfaces do not count. Raises
+    InputError for a start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or
+    outside the field.
     """
     field = field_at(task.stamp_ns)
     q = checked_posture(model, task.start, what="start")
@@ -236,7 +236,7 @@ class _Course:
         )
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
-        """True at the last goal; after an earlier one the next begins. Twists have none."""
+        """True at the last goal; after an earlier goal, the next begins. Twists have none."""
         if self._detour is not None:
             self._detour.advance(self._config.period, step.pose_error)
             self._detour = None if self._detour.is_over else self._detour
@@ -289,7 +289,7 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
 class OpenLoopTask:
     """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad]: the preferred posture with a goal pose (None: the model's `middle`).
+    home (J,) [rad]: posture to lean to with a goal pose (None: `model.middle`).
     """
 
     frame: str

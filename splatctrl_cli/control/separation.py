@@ -1,4 +1,4 @@
-"""Protective separation distance of ISO/TS 15066:2016, 5.5.4.2.3 (now in ISO 10218-2:2025), and its declared inputs.
+"""Protective separation distance of ISO/TS 15066:2016, 5.5.4.2.3 (now in ISO 10218-2:2025).
 
     S_p = S_h + S_r + S_s + C + Z_d + Z_r                                                          (1)
 
@@ -103,8 +103,8 @@ class StopRow:
     def at(self, share: Float64) -> tuple[Float64, Float64]:
         """Time (T,) and distance (T,) at shares (T,) of the speed limit.
 
-        Distances are linear between declared speeds, which overestimates v^2. Times are at least the first one, or 0
-        at standstill. Above the limit, times grow with v and distances with v^2.
+        Distances are linear between declared speeds, which exceeds v^2. Times are at least the first, 0 at
+        standstill. Above the limit, times grow with v, distances with v^2.
         """
         over = np.maximum(share, 1.0)
         time = np.where(share > STANDING, np.interp(share, self.speed, self.time), 0.0)
@@ -115,7 +115,7 @@ class StopRow:
 class StopTable:
     """Declared stops by joint, rows by rising extension; the next larger extension counts.
 
-    A sphere's travel is the sum of its arcs about all axes, because axes that stop independently leave the path.
+    A sphere's travel is the sum of its arcs about all axes: independent stops leave the path.
     """
 
     rows: Sequence[Sequence[StopRow]]
@@ -171,7 +171,7 @@ class Approach:
         return scale
 
     def time_to_contact(self, motion: ArmMotion, separation: Float64) -> Float64:
-        """Least time (T,) [s] in which person and arm, at their speeds, close a separation (T, M) [m]."""
+        """Least time (T,) [s] for person and arm to close a separation (T, M) [m]."""
         return np.asarray(np.min(np.maximum(separation, 0.0) / (self.person_speed + motion.approach), axis=1))
 
 
@@ -231,9 +231,9 @@ class DeclaredSeparation:
 def read_separation(path: Path, axes: Sequence[str]) -> DeclaredSeparation:
     """Read the declared inputs.
 
-    axes: the robot's joints; a stop table must have all.
+    axes: the robot's joints.
     Raises InputError for a missing file; UsageError for text that is not TOML, an unknown or missing key, or a value
-    out of range. A stop table must be complete, and its values must rise with the speed.
+    out of range. A stop table must be complete for all axes, and rise with the speed.
     """
     faults = (tomllib.TOMLDecodeError, UnicodeDecodeError)
     with refuse_faults(f"{path}: not valid TOML", *faults, remedy=REMEDY, error=UsageError):

@@ -51,7 +51,7 @@ class Intervention:
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityMargin:
-    """Room that a joint velocity leaves in its tightest rows, negative if it violates them.
+    """Room of a joint velocity in its tightest rows, negative if it violates them.
 
     barrier: least ``h - G v`` [m/s]; limit: least distance to the joint limits' box [rad/s].
     """
@@ -66,12 +66,12 @@ class VelocityMargin:
 class ControlStep:
     """The controller's decision at one configuration.
 
-    velocity (J,) [rad/s], scaled by `scale` (below 1 if a row's distance after the step would be too small);
+    velocity (J,) [rad/s], scaled by `scale` (below 1 if a distance after the step would be too small);
     pose_error (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's field; self_clearance [m]
     (inf without pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least
     distance (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual, status:
-    worst KKT residual and status of the last solution; num_refused: number of unusable solutions; by_surface:
-    argument for the next `step`.
+    worst KKT residual and status of the last solution; num_refused: number of unusable solutions; by_surface: for the
+    next `step`.
     """
 
     velocity: Float64
@@ -135,7 +135,7 @@ class QpIkController:
         solver: QpSolver | None = None,
         terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad]: posture to lean to (default: the model's `middle`); terms: added to the paper's.
+        """home (J,) [rad]: posture to lean to (default: `model.middle`); terms: added to the paper's.
 
         Raises InputError for a robot without moving spheres, velocity limits or required coverage.
         """
@@ -155,7 +155,7 @@ class QpIkController:
         self._reach_weight = eliminated_weight(*configured_weights(config))
 
     def replace_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
-        """Controller on a newer field; see `SceneRows.replace_field`."""
+        """Controller on a newer field (`SceneRows.replace_field`)."""
         other = copy(self)
         other._builder = self._builder.replace_field(field, balls)
         return other
@@ -172,10 +172,10 @@ class QpIkController:
     ) -> ControlStep:
         """Joint velocity at q (J,) [rad] towards a goal pose (4, 4).
 
-        distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
-        (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
-        by_surface: spheres that count by their link's surface. A sphere with a relaxed row joins them if its link's
-        surface is farther. Raises InputError for a non-finite q, NotEvaluableError where the field has no distance.
+        distance_rate: dd/dt [m/s] of the moving spheres, (M,) or one number. guide: the goal's motion (None: at
+        rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts). by_surface: spheres
+        that count by their link's surface; with a relaxed row, a sphere joins them if that surface is farther. Raises
+        InputError for a non-finite q, NotEvaluableError where the field has no distance.
         """
         moment = Moment(
             stamp_ns=0,
@@ -224,7 +224,7 @@ class QpIkController:
         return View(error=error, state=state, rows=self._builder.at(state))
 
     def take_velocity(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
-        """Step of an external velocity (J,) [rad/s]; slack is its violation of a row.
+        """Step of an external velocity (J,) [rad/s]; slack is its row violation.
 
         Without a velocity the arm stops, for the reason in `status`.
         """
@@ -243,7 +243,7 @@ class QpIkController:
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """Room that any joint velocity (J,) [rad/s] leaves at q (J,).
 
-        The change from the last velocity does not count. Raises the errors of `step`.
+        The change of velocity does not count. Raises the errors of `step`.
         """
         q = checked_posture(self._model, q)
         lowest, highest = self._limits.box(q)
@@ -261,8 +261,8 @@ class QpIkController:
     def _descend(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """Rows, the ladder's choice, and True if no distance after the step is too small.
 
-        A sphere that would meet another surface than its row's gets a further row, and the ladder runs again. These
-        cutting planes take at most `config.max_cuts` rounds.
+        A sphere that would meet another surface than its row's gets a further row, and the ladder runs again: cutting
+        planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = len(self._builder.scene.names), self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
@@ -280,7 +280,7 @@ class QpIkController:
         return rows, choice, False
 
     def _sticking_out(self, state: State, rows: Rows, choice: Choice) -> Bool:
-        """True for spheres (M,) with a relaxed row whose link's surface is farther than the sphere."""
+        """True for spheres (M,) with relaxed rows whose links' surfaces are farther away."""
         distance, scene = rows.external.distance, self._builder.scene
         has_given_way = rows.spread(choice.slack)[: len(distance)] > self._config.slack_tolerance
         return np.asarray(scene.raise_by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)

@@ -71,7 +71,7 @@ def braking_speed(room: Float64, gain: float, deceleration: Float64, period: flo
         r(v) = a / alpha^2 + (v^2 - a^2 / alpha^2) / (2 a) + (v - a / alpha) dt,
 
     continuous at ``a / alpha``. Because ``r(v - a dt) <= r(v) - v dt``, the room after a step at v allows v - a dt.
-    The speed never exceeds ``alpha r``, and equals it where r < 0.
+    The speed is at most ``alpha r``, and equal where r < 0.
     """
     linear = gain * room
     knee = deceleration / gain
@@ -120,7 +120,8 @@ class JointLimits:
         """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
         Without last_velocity the acceleration limit does not count. It gives way where it contradicts velocity or
-        position limits, so that the box is never empty. In states that this box led to, only by_position contradicts.
+        position limits, so that the box is never empty. In states that this box led to, it gives way only to
+        by_position.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
@@ -154,8 +155,8 @@ def velocity_box(
     """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
     III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, with the gain alpha [1/s]. An
-    acceleration (J,) [rad/s^2] replaces the first two bounds by `braking_speed`. For q outside its limits, the box
-    demands motion back, at most at the velocity limit.
+    acceleration (J,) [rad/s^2] replaces the first two by `braking_speed`. For q outside its limits, the box demands
+    motion back, up to the velocity limit.
     """
     above, below = upper - q, q - lower
     if acceleration is None:
@@ -188,7 +189,7 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
 class Strain:
     """Largest velocity and acceleration (T,) as shares of their joints' limits.
 
-    velocity_joint, acceleration_joint (T,): indices of these joints. acceleration: 0 without a limit.
+    velocity_joint, acceleration_joint (T,): these joints. acceleration: 0 without a limit.
     """
 
     velocity: Float64
@@ -200,7 +201,7 @@ class Strain:
 class MotionLimits:
     """A motion's velocities and accelerations as shares of limits, less encoder error.
 
-    Velocities are taken since the last state and over `MOTION_WINDOW`, accelerations from three positions
+    Velocities are averaged since the last state and over `MOTION_WINDOW`, accelerations over three positions
     `MOTION_WINDOW` apart. A sample covers the time before it.
     """
 
@@ -262,9 +263,10 @@ NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # among the moving spheres
 class State:
     """A step's state, the input of its terms.
 
-    q (J,) [rad]; box: lowest, highest velocity (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: twist of `frame` to
-    reach; guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt
-    [m/s] of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
+    q (J,) [rad]; box: lowest, highest velocity (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: desired twist of
+    `frame`; guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate:
+    dd/dt [m/s] of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's
+    surface.
     """
 
     model: RobotModel
@@ -379,7 +381,7 @@ class Barrier(Columns):
 class BarrierTerm(ABC):
     """M named rows that bound the velocity.
 
-    A term without distances defines only `rows`: infinite distances exempt it from the check after a step.
+    A term without distances defines only `rows`: infinite distances exempt it from a step's check.
     """
 
     kind = RowKind.LIMIT

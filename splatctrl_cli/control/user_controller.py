@@ -23,8 +23,8 @@ class ControllerStart:
     """A controller's initial input.
 
     joints (J,): names, in the order of all vectors; lower, upper, home (J,) [rad]; velocity_limit (J,) [rad/s];
-    acceleration_limit (J,) [rad/s^2] (None: no limit); frame: the driven one; period [s] of a velocity; margin [m] to
-    the scene.
+    acceleration_limit (J,) [rad/s^2] (None: no limit); frame: to drive; period [s] of a velocity; margin [m] to the
+    scene.
     """
 
     joints: tuple[str, ...]
@@ -39,7 +39,6 @@ class ControllerStart:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "ControllerStart":
-        """Parse the first line."""
         arrays = ("lower", "upper", "velocity_limit", "acceleration_limit", "home")
         return cls(
             joints=tuple(document["joints"]),
@@ -67,12 +66,12 @@ class ClearanceRow:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerInput:
-    """A controller's input at a step, in world axes.
+    """A controller's input at a step, in world.
 
-    q (J,) [rad]; dq (J,) [rad/s]: last velocity; goal, pose: poses (4, 4) of goal and frame; error (6,) [m, rad]:
+    q (J,) [rad]; dq (J,) [rad/s]: last velocity; goal, pose (4, 4): of goal and frame; error (6,) [m, rad]:
     twist from frame to goal in a second, linear first; jacobian (6, J) of the frame. goal_twist (6,) [m/s, rad/s],
-    goal_posture (J,) [rad] and goal_velocity (J,) [rad/s] are None if the goal is only a pose. rows() returns the
-    built-in controller's rows: moving spheres, and pairs whose row an allowed velocity could violate.
+    goal_posture (J,) [rad] and its goal_velocity (J,) [rad/s] are None if the goal is only a pose. rows() returns the
+    built-in controller's: moving spheres, and pairs that an allowed velocity could violate.
     """
 
     stamp_ns: int

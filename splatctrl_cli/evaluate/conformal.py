@@ -1,8 +1,8 @@
 """A bound on a map's error from held-out depth: split conformal prediction over time.
 
-A frame set's miss is its largest distance from held-out surface points to the map. Frame sets form stretches, as long
-as the misses' autocorrelation time, and that far apart. A stretch's score is its largest miss. If n scores and a new
-one are exchangeable, the k-th smallest bounds the new one with probability at least `confidence`, for
+A frame set's miss is its largest distance from held-out points to the map. Frame sets form stretches, as long as the
+misses' autocorrelation time and as far apart; a stretch's score is its largest miss. If n scores and a new one are
+exchangeable, the k-th smallest bounds the new one with probability at least `confidence`, for
 ``k = ceil((n + 1) * confidence)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
 The bound is for a further stretch, not each state, and not for surface without depth, or another scene or camera.
@@ -23,7 +23,7 @@ ROUNDING = 1e-9  # error of (n + 1) * confidence where that is a whole number
 class ConformalBound:
     """A score [m] that a further stretch does not exceed with `confidence`.
 
-    num_stretches: of `length` frame sets each; at: index of the frame set with this score.
+    num_stretches: of `length` frame sets; at: index of the frame set with this score.
     """
 
     bound: float
@@ -34,9 +34,9 @@ class ConformalBound:
 
 
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
-    """The bound from misses (T,) [m] of frame sets in order of time, NaN if unknown.
+    """The bound from misses (T,) [m] of frame sets by time, NaN for none.
 
-    None below FEWEST_STRETCHES stretches. n stretches lower `confidence` to at most n / (n + 1).
+    None below FEWEST_STRETCHES stretches. n stretches allow a `confidence` up to n / (n + 1).
     """
     if not np.isfinite(misses).any():
         return None
@@ -66,8 +66,8 @@ def conformal_rank(num_scores: int, confidence: float) -> int:
 def autocorrelation_time(misses: Float64) -> int:
     """Number of frame sets, at least 1, over which misses (T,) correlate.
 
-    ``1 + 2 sum_k rho_k``, rounded up; the sum ends at the first lag k with autocorrelation rho_k <= 0 (Geyer 1992, by
-    single lags). NaN is left out; constant misses give 1.
+    ``1 + 2 sum_k rho_k``, rounded up; the sum ends before the first lag k with autocorrelation rho_k <= 0 (Geyer
+    1992, by single lags). NaN is left out; constant misses give 1.
     """
     is_there = np.isfinite(misses)
     apart = np.where(is_there, misses, 0.0) - is_there * (np.mean(misses[is_there]) if is_there.any() else 0.0)

@@ -83,8 +83,8 @@ def field_accuracy(
     """Compare fields with the truth at points outside the objects, as in ``field.json``.
 
     everywhere, seen: each field's bands, at all and at seen points; seen is empty if unknown. over_estimate: share of
-    seen points (all, if unknown) up to 20 cm where `hard` exceeds the truth by more than `allowance` [m], 1 cm +
-    `median_radius`, and the excess. holds: there are such points, and none exceeds.
+    seen points (all, if unknown) up to 20 cm where `hard` exceeds the truth by more than `allowance`, and the excess.
+    allowance [m]: 1 cm + `median_radius`. holds: there are such points, and no excess.
 
     distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): a training camera saw the
     nearest true surface point; None if unknown. Raises InputError for unequal lengths, or without `hard`.
@@ -121,7 +121,7 @@ def distance_at(distance: GridDistance, cells: NDArray[np.int64]) -> Float64:
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     """A grid's distances by field name: sdf, hard, se, gpdf.
 
-    Without a channel hard, it is ``bound`` plus the header's margin, within a micrometre. Raises InputError without
+    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre. Raises InputError without
     hard and bound.
     """
     distances: dict[str, GridDistance] = {
@@ -197,13 +197,13 @@ def compare_with_truth(
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
     """Accuracy of `FIELDS` where `frames` saw the surface (``field.json``), and reliability by probability form.
 
-    Of sampled cells, world [m]: points (Q, 3) are the centres, surface (Q, 3) the nearest true surface points, fields
-    the `FIELDS` (Q,), distance (Q,) is the truth. name: of the truth. workspace: where the scene has splats.
-    probabilities: functions of points (Q, 3) and sdf (Q,) [m].
+    Of sampled cells, world [m]: points (Q, 3), their centres; surface (Q, 3), nearest true surface points; fields,
+    `FIELDS` (Q,); distance (Q,), the truth. name: of the truth. workspace: where the scene has splats. probabilities:
+    functions of points (Q, 3) and sdf (Q,) [m].
 
-    num_blank cells have no distance. num_near other cells lie outside objects, within 20 cm. A training camera saw
-    the nearest surface point of num_seen of them in the workspace, and of num_outside_workspace outside it.
-    reliability: at seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within
+    num_blank cells have no distance; num_near others lie outside objects, within 20 cm. A training camera saw the
+    nearest surface point of num_seen of these in the workspace, and of num_outside_workspace outside it. reliability:
+    at seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within
     `PROBABILITY_NEAR`, or None. Raises NotEvaluableError with no cell near an object.
     """
     sdf = fields["sdf"]
@@ -255,9 +255,9 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     """Errors of cells sampled by `seed`, against the exact mesh distance, as in ``field.json``.
 
     The mesh is in the grid's frame [m]. num_in_reach cells lie in its box widened by 20 cm; num_drawn were sampled.
-    Of these, num_unknown have no distance, num_inside lie inside the mesh, and num_near lie outside, within 20 cm.
-    Only num_near are compared: inside a closed mesh, the field is a shell. An open mesh's distance is unsigned.
-    Raises InputError for a file that is no mesh, NotEvaluableError with no cell near the mesh.
+    Of these, num_unknown have no distance, num_inside lie inside the mesh, and num_near outside within 20 cm. Only
+    num_near are compared: inside a closed mesh, the field is a shell. An open mesh's distance is unsigned. Raises
+    InputError for a file that is no mesh, NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)

@@ -1,8 +1,8 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates. A lower field errs only if the ball around x, up to that point,
-was seen free; else the field may know another surface.
+distance to the nearest measured point over-estimates. A lower field errs only if the ball up to that point was seen
+free; else it may know another surface.
 """
 
 import math
@@ -43,11 +43,11 @@ def cloud_score(
 ) -> dict[str, float]:
     """Distances [m] between points (P, 3) of a surface and a reference (R, 3), world.
 
-    As in DTU's evaluation and jzhangbs/DTUeval-python, eval.py, figures are means of distances below `max_distance`;
-    larger distances count only in the `*_beyond` shares. accuracy: from surface points, all or those of counts (P,),
-    to the reference. completeness: from the reference to the surface. chamfer: the mean of accuracy and completeness.
-    completeness_seen: from reference points seen (R,) by a training camera. nan without points. unit: metres per unit
-    of the reference's file. Raises NotEvaluableError without near points, or if another unit fits better.
+    As in DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; larger
+    distances count only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference.
+    completeness: the reference to the surface. chamfer: the mean of accuracy and completeness. completeness_seen: of
+    reference points seen (R,) by a training camera. nan without points. unit: metres per unit of the reference's
+    file. Raises NotEvaluableError without near points, or if another unit fits better.
     """
     refuse_if(
         not max_distance > 0, f"--cloud-max: expected a distance above 0 m, got {max_distance:g}", error=UsageError
@@ -91,7 +91,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Intersection over union of the boxes of 1 % to 99 % of points, widened by `margin` [m]."""
+    """Intersection over union of boxes from percentile 1 to 99, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -112,8 +112,8 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 def space_out(points: Float64, spacing: float) -> Float64:
     """Points (P, 3), visited in random order, farther than `spacing` [m] from all chosen before.
 
-    As in DTU's thinning (DTUeval-python, eval.py), every layer of a scattered surface counts. Before, `thin` leaves
-    one point per cube of edge `spacing` / 2, or of edge `spacing` if over 6 million are left.
+    As in DTU's thinning (DTUeval-python, eval.py), every layer of a scattered surface counts. First, `thin` leaves a
+    point per cube of edge `spacing` / 2, or `spacing` if over 6 million are left.
     """
     _check_spacing(spacing)
     some = thin(points, spacing / 2)
@@ -138,7 +138,7 @@ def space_out(points: Float64, spacing: float) -> Float64:
 def thin(points: Float64, spacing: float) -> Float64:
     """The first of points (P, 3) per cube of edge `spacing` [m].
 
-    Thinning parts of the points beforehand changes nothing.
+    Thinning some points beforehand changes nothing.
     """
     _check_spacing(spacing)
     if not len(points):
@@ -202,10 +202,10 @@ def compare_with_held_out_depth(
 ) -> dict[str, Any]:
     """Errors [m] of interpolated distances on held-out rays sampled by `seed`, as in ``field.json``.
 
-    on_surface: at measured points, whose distance is 0. before: on the rays in front of them. There, a point is
-    `seen` if the ball up to its nearest measured point was seen free, so that under-estimates count, too.
-    over_estimate: over all points. num_edges pixels lie at depth edges, num_outside points outside the grid,
-    num_unknown points at a grid corner without distance.
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; there, a point is `seen` if the
+    ball up to its nearest measured point was seen free, so that under-estimates count, too. over_estimate: over all
+    points. num_edges pixels lie at depth edges, num_outside points outside the grid, num_unknown at a corner without
+    distance.
 
     frames: of held-out cameras, in the grid's frame. counted: per frame (H, W), False on objects that the field
     leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without a measured
@@ -264,7 +264,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
 
 
 def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
-    """Measured points (M, 3) in a box, their camera centres, and the number of omitted edge pixels."""
+    """Measured points (M, 3) in a box, their camera centres, and number of omitted edge pixels."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
             f"counted: expected a mask of the size of each of {len(frames)} frames, got {len(counted)} masks"
@@ -285,7 +285,7 @@ def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: B
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """True (H, W) where a neighbour's depth differs by more than the share HELD_OUT_EDGE."""
+    """True (H, W) where a neighbour's depth differs by more than HELD_OUT_EDGE, a share."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2

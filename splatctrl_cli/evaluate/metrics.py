@@ -14,8 +14,6 @@ from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
 
 
 class Better(StrEnum):
-    """The direction in which a figure improves."""
-
     HIGHER = "higher"
     LOWER = "lower"
     NEITHER = "neither"
@@ -82,7 +80,7 @@ def lowest(values: Float64) -> float | None:
 
 
 def largest(values: Float64) -> float | None:
-    """The largest value; None if one is infinite, or without any."""
+    """The largest value; None if a value is infinite, or all are NaN."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 
@@ -139,8 +137,8 @@ def clearance_agreement(
 ) -> dict[str, float | None]:
     """Agreement of clearance with truth (T,) [m], within 10 cm of seen surface.
 
-    By `FIGURES`: number of states compared; median, 95 % quantile and largest of |clearance - truth|; largest
-    over-estimate; tolerance; share within it. Errors and share are None without states.
+    By `FIGURES`: number of states; median, 95 % quantile and largest of |clearance - truth|; largest over-estimate;
+    tolerance, and share within it. Errors are None without states.
     """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
@@ -160,7 +158,7 @@ def mark_seen(
 ) -> None:
     """Set `seen` (T,) for points [m] that `frame` saw by the point's stamp.
 
-    points_world (T, 3) are read in blocks, and only if not yet seen.
+    points_world (T, 3) not yet seen are read in blocks.
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)

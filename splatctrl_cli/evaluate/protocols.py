@@ -42,10 +42,10 @@ class Split:
 class ScoreProtocol:
     """A named scoring protocol.
 
-    mask: pixels of the published figure, which are those of a given mask, of the object, or with reference depth.
-    fill: grey outside the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond the
-    border. size (width, height) [px], scans: as published. Without `scored`, every `every`-th view from `first` on is
-    scored; if `every` is 0, all views are scored and train. Without `training`, views that are not scored train.
+    mask: pixels of the published figure: of a given mask, of the object, or with reference depth. fill: grey outside
+    the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond the border. size
+    (width, height) [px], scans: as published. Without `scored`, every `every`-th view from `first` on is scored; with
+    `every` 0, all views are scored and train. Without `training`, views that are not scored train.
     """
 
     name: str

@@ -87,9 +87,9 @@ def score_view(
     """Score a rendering against `frame`, by `PROTOCOL`.
 
     Returns figures by flat name (``psnr_seen`` [dB], ``depth_median_all`` [m]), nan for an empty region. color (H, W,
-    3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen (H, W): pixels seen in training;
-    mask (H, W): of the mask rule. The published SSIM has grey `fill` outside the mask; without a mask, it exists only
-    if is_zero_padded. Invalid pixels of `frame` are in no region.
+    3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W): pixels seen in
+    training, pixels of the mask rule. The published SSIM has grey `fill` outside the mask; without a mask, it exists
+    only if is_zero_padded. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -254,7 +254,7 @@ def _common(protocols: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def other_scans(protocol: Mapping[str, Any], scans: Sequence[str]) -> list[str]:
-    """Warning of scans that differ from those of the published mean."""
+    """Warning of scans that differ from the published mean's."""
     published = protocol["published_scans"]
     missing = [number for number in published or () if f"scan{number}" not in scans]
     others = [name for name in scans if name not in {f"scan{number}" for number in published or ()}]
@@ -380,7 +380,7 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
 
 
 def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
-    """Views whose photo is clearly nearer to another view's render than to their own."""
+    """Views whose photo is clearly nearer another view's render."""
     if len(thumbnails) < 2:
         return []
     names, photos, renders = zip(*thumbnails, strict=True)

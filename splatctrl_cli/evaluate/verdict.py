@@ -33,9 +33,9 @@ class Reason:
     """One criterion's finding; `Criterion.reasons` fills in `criterion`.
 
     value, threshold: in `unit`, or None. time_s [s]: as in the output's files. place (3,) [m]: world. who: link,
-    sphere, joint or camera. cause: clause after the sentence, such as "near" an obstacle. count: states, views or
-    points behind the value. label: the outcome's name if this reason decides, such as "contact". is_note: printed,
-    but does not affect the verdict.
+    sphere, joint or camera. cause: appended to the sentence. count: states, views or points behind the value. label:
+    the outcome's name if this reason decides, such as "contact". is_note: only printed, without effect on the
+    verdict.
     """
 
     criterion: str = ""
@@ -68,7 +68,7 @@ note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
 
 
 def passed_reason(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
-    """A passed criterion, which is not printed."""
+    """A passed criterion, not printed."""
     return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
 
 
@@ -131,7 +131,7 @@ class Verdict:
 
     @property
     def decisive(self) -> tuple[Reason, ...]:
-        """Reasons that did not pass, first those of the outcome."""
+        """Reasons that did not pass, the outcome's first."""
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
 
     @property
@@ -277,7 +277,7 @@ def check_gate_names(
 ) -> None:
     """Raise UsageError for a metric not in `names`, before the work.
 
-    elsewhere: metrics that other options would add, by those options.
+    elsewhere: metrics that other options add, by those options.
     """
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)

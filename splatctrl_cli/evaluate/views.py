@@ -21,8 +21,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number. With a clock, it counts the camera's views; without, all frames, unless it is
-    the stamp.
+    The name is the camera and a count of its views (without a clock, of all frames) or the stamp.
     """
 
     name: str
@@ -42,7 +41,7 @@ def views_to_score(
     """The frames of the `scoring` cameras in time order.
 
     With a clock, each training camera's newest frame up to the view's stamp is known; without, all its frames.
-    corrected: gives a frame the pose, exposure and depth used in training.
+    corrected: gives a frame training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -93,7 +92,7 @@ def surface_points(frame: RgbdFrame) -> tuple[Float64, Bool]:
 
 
 def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """True (H, W) where one of `others` measured the frame's surface; nearest cameras come first."""
+    """True (H, W) where one of `others` measured the frame's surface."""
     points_world, seen = surface_points(frame)
     center = frame.T_world_camera[:3, 3]
     nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
@@ -150,8 +149,8 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
     """SSIM of images in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
     scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
-    moments, 3 border pixels left out. Its data range of 2 for floats raises the figure: compare it only with figures
-    computed in this way. nan below 7 pixels, or for an empty mask.
+    moments, 3 border pixels left out. Its data range of 2 for floats raises the figure: compare it only with such
+    figures. nan below 7 pixels, or for an empty mask.
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan

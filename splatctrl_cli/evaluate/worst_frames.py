@@ -43,7 +43,7 @@ Sight = tuple[Moment, RgbdFrame]
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within 0.5 s before and after. NaN does not count.
+    Each is the least within 0.5 s. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     padded = np.concatenate([[np.inf], values, [np.inf]])

@@ -65,13 +65,12 @@ class LinkCoverage:
 
     @property
     def uncovered_share(self) -> float:
-        """Surface share outside all spheres."""
         return self.uncovered_area / self.area
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageReport:
-    """Coverage by link; stray_spheres: number of spheres on bodies without collision geometry."""
+    """Coverage by link; stray_spheres: number on bodies without collision geometry."""
 
     links: tuple[LinkCoverage, ...]
     num_spheres: int
@@ -102,7 +101,7 @@ class CoverageReport:
 
     @property
     def max_protrusion(self) -> float:
-        """Largest protrusion [m] of any sphere."""
+        """Largest protrusion [m]."""
         return max(link.protrusion for link in self.links)
 
 
@@ -111,8 +110,7 @@ def coverage_of_solids(
 ) -> CoverageReport:
     """Measure how spheres cover the `solids` of each link of `urdf`.
 
-    Spheres on links joined by fixed joints count for each. Results are cached. Raises InputError for a sphere on an
-    unknown link.
+    Spheres of a link's whole rigid body count. Cached. Raises InputError for a sphere on an unknown link.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -188,7 +186,7 @@ def uncovered_area(
 ) -> tuple[float, float, float]:
     """Area [m2] with phi > 0: best guess, proven lower and upper bound.
 
-    Triangles are halved until they are in one sphere, outside all spheres, or at most `resolution` [m] long.
+    Triangles are halved until they are in one sphere, outside all, or at most `resolution` [m] long.
     """
     outside = unsure = guess = 0.0
     pending = triangles

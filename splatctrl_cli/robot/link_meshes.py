@@ -82,8 +82,8 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 class Solid:
     """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    slack: largest distance of the true surface from `surface`. body: closed mesh for inside tests; of an open surface
-    the convex hull, None if flat. ball: centre (3,), radius of a sphere.
+    slack: largest distance of `surface` from the true one. body: closed mesh for inside tests, or an open surface's
+    convex hull, None if flat. ball: centre (3,), radius.
     """
 
     link: str
@@ -127,8 +127,8 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
 def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:
     """A mesh's file.
 
-    ``package://NAME/REST`` is NAME/REST in one of `folders` or a folder above the URDF, or REST in such a folder
-    called NAME. A path without scheme is relative to the URDF. Raises InputError if not found.
+    ``package://NAME/REST`` is NAME/REST, or REST in a folder NAME, among `folders` and folders above the URDF. A path
+    without scheme is relative to the URDF. Raises InputError if not found.
     """
     name = mesh.filename
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
@@ -156,7 +156,7 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 class SolidDistance:
     """Upper bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    It is exact outside, and inside no deeper than the truth. For an open, flat surface it is unsigned.
+    It is exact outside, inside no deeper than the truth, and unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:

@@ -33,11 +33,11 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names (J,); lower, upper (J,) [rad or m]; velocity_limit (J,) [rad/s or m/s]; middle (J,): of the limits, 0
-    without limits; base_position (3,) [m]; sphere_set: in link frames; frame_names: links that `frame_pose` knows;
-    left_out: links of the sphere file missing from the URDF; bare_links: URDF links with a body but no sphere;
-    coverage: None if unknown, for the reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if
-    unknown; locked: values of locked fingers.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without limits;
+    base_position (3,) [m]; sphere_set: in link frames; frame_names: links that `frame_pose` knows; left_out:
+    sphere-file links missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if
+    unknown, for the reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; locked:
+    values of locked fingers.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class RobotModel:
         """Build the robot of a URDF, with given spheres or `default_spheres`.
 
         T_world_base (4, 4): of the root link (default: world origin). locked: values [rad or m] of joints to lock,
-        which also locks their mimics. packages: folders for ``package://``. Raises InputError.
+        with their mimics. packages: folders for ``package://``. Raises InputError.
         """
         file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         with refuse_faults(f"{file.path}: not a URDF that can be built", ValueError, RuntimeError):
@@ -135,7 +135,7 @@ class RobotModel:
     def moved_by(self, names: Sequence[str]) -> "RobotModel":
         """Robot for a log that moves the joints `names`.
 
-        Fingers that the log does not move, and their mimics, are locked in the middle of their limits (`locked`).
+        Other fingers and their mimics are locked in the middle of their limits (`locked`).
         """
         fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
         if not fingers:
@@ -204,7 +204,7 @@ class RobotModel:
         return self._surfaces[number]
 
     def at(self, stamp_ns: int) -> "RobotModel":
-        """Robot whose surface at all times is that of a stamp [ns]."""
+        """Robot whose surface is always that of a stamp [ns]."""
         return self._change(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
@@ -221,7 +221,7 @@ class RobotModel:
 
     @property
     def self_allowance(self) -> Float64:
-        """Reduction (P,) [m] of each pair's margin from the configured margin (`robot.self_margins`)."""
+        """Reduction (P,) [m] of each pair's margin (`robot.self_margins`)."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _change(self, **attributes: object) -> "RobotModel":
@@ -231,7 +231,7 @@ class RobotModel:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings about these spheres, in sentences."""
+        """Warnings about these spheres."""
         name, bare, lost = self.urdf.path.name, ", ".join(self.bare_links), ", ".join(self.left_out)
         sentences = (
             (bare, f"{name}: no sphere covers {bare}; the clearance of these links is unknown"),
@@ -252,7 +252,6 @@ class RobotModel:
 
     @property
     def reach_box(self) -> Box:
-        """Box [m] around the base's reach."""
         reach = self.reach()
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
 
@@ -286,7 +285,7 @@ class RobotModel:
     ) -> dict[str, Float64]:
         """Signed gap (T,) [m] of each meshed link to the nearest ball.
 
-        centers (N, 3), radii (N,) [m]: of the balls, world; positions (T, J).
+        Balls: centers (N, 3), radii (N,) [m], world. positions (T, J).
         """
         surface = self.surface
         return {
@@ -299,8 +298,7 @@ class RobotModel:
     def link_distances(self) -> dict[str, Callable[[Float64, Bool | None], Float64]]:
         """Signed distance functions of meshed links.
 
-        Each maps points (Q, 3), link frame, to distances (Q,) [m]. Its second argument is a mask (Q,) of points known
-        to be outside, or None.
+        Each maps points (Q, 3), link frame, and a mask (Q,) of points surely outside, or None, to distances (Q,) [m].
         """
         links = {self.surface.links[number] for number in self.surface.trees}
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}

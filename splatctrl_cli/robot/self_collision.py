@@ -58,7 +58,7 @@ CHUNK = 200  # postures at a time
 class LinkPair:
     """Two links with spheres, and their spheres' gap over sampled postures.
 
-    left_out: reason to omit the pair, None if checked. least_gap, largest_gap [m] (nan: not sampled); hit_share: of
+    left_out: reason to omit it, None if checked. least_gap, largest_gap [m] (nan: not sampled); hit_share: of
     postures in contact.
     """
 
@@ -93,9 +93,9 @@ def self_collision_pairs(
 ) -> SelfCollisionPairs:
     """Pairs of spheres that may collide.
 
-    Omitted are links of one rigid body or joined by one joint, and the `disabled` pairs of an SRDF. Without
-    `disabled`, links in contact in all `num_postures` uniform postures are omitted, too. With `drop_never`, so are
-    links never nearer than NEVER_MARGIN.
+    Omitted are links of one rigid body or joined by one joint, and an SRDF's `disabled` pairs. Without `disabled`,
+    links in contact in all `num_postures` uniform postures are omitted, too; with `drop_never`, also links never
+    nearer than NEVER_MARGIN.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
@@ -126,7 +126,7 @@ def self_collision_pairs(
 
 
 def drop_disabled(model: RobotModel, disabled: Collection[frozenset[str]]) -> Index:
-    """`self_pairs` (P, 2) without those of links that an SRDF has `disabled`."""
+    """`self_pairs` (P, 2) without links that an SRDF has `disabled`."""
     links, pairs = model.sphere_set.links, model.self_pairs()
     return np.asarray(
         pairs[np.array([frozenset((links[a], links[b])) not in disabled for a, b in pairs], dtype=bool)]

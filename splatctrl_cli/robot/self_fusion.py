@@ -1,7 +1,7 @@
 """Self-models learned from depth fused in each link's frame over clearly different configurations.
 
-Depth is fused as projective signed distances (Curless and Levoy, A volumetric method for building complex models from
-range images, 1996). L links, V views, K configurations of a link, N cells, F triangles.
+Fusion of projective signed distances (Curless and Levoy, A volumetric method for building complex models from range
+images, 1996). L links, V views, K configurations of a link, N cells, F triangles.
 """
 
 from collections.abc import Iterator, Sequence
@@ -80,10 +80,9 @@ def learn(
 
     T_world_link (V, L, 4, 4): of the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, doubled up to `MOST_REACH` while parts reach it. In a run of configurations, a grid cell is
-    robot if `NUM_CONFIGURATIONS` show it as a surface and at most a share `FREE_SHARE` see through it. Most views of
-    a configuration decide. The cell must also leave its place in the world with the link, and move relative to each
-    nearer link. A link that moves too little gets configurations half as far apart. Raises InputError if no link can
-    be learned.
+    robot if `NUM_CONFIGURATIONS` show it as surface and at most `FREE_SHARE` see through it, by most of their views.
+    It must also leave its place in the world with the link, and move against each nearer link. A link that
+    moves too little gets configurations half as far apart. Raises InputError if no link can be learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -126,8 +125,8 @@ def learn(
 class _View:
     """An image: depth (H, W) float32 [m], and its explanation.
 
-    links (h, w) int16: index of the link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some
-    link; points_world (M, 3) [m]: unexplained points.
+    links (h, w) int16: the link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some link;
+    points_world (M, 3) [m]: unexplained points.
     """
 
     stamp_ns: int

@@ -49,8 +49,8 @@ class Fused:
     def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
         """True for cells (N,) inside a surface that is robot.
 
-        At least `least` configurations show such a cell, at most a share `most_free` see through it. gap (N,) [m]:
-        from the link's own surface.
+        At least `least` configurations show the cell, at most a share `most_free` see through it. gap (N,) [m]: from
+        the link's surface.
         """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
@@ -89,9 +89,9 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
     """Whole recording, and intervals shared by the runs of enough connected cells.
 
-    Configurations that see through a cell bound its run. Before a part's interval and after it, some configuration
-    sees through a share `GONE` of the part. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface;
-    stamps (K,) [ns].
+    Configurations that see through a cell bound its run. Before and after a part's interval, some configuration sees
+    through a share `GONE` of the part. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's surface; stamps
+    (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -135,8 +135,8 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """Number (N,) of the interval in which each cell is robot, -1 for none.
 
-    Votes of robot cells around the cell decide. In the first interval, which is the whole recording, cells next to
-    robot cells need fewer configurations.
+    Votes of robot cells around the cell decide. In the first interval, the whole recording, cells next to robot cells
+    need fewer configurations.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])

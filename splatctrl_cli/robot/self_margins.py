@@ -1,7 +1,6 @@
 """Distances between a robot's link surfaces, and the margins that their spheres can keep.
 
-Spheres decide if they are far enough apart, else triangles do, exactly (coal). T postures, J joints, S spheres, K
-pairs.
+Spheres decide if far enough apart, else triangles, exactly (coal). T postures, J joints, S spheres, K pairs.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -83,8 +82,8 @@ def depth_in(solid: Solid) -> Depth:
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
     """Gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
 
-    The gap is exact between triangles, a lower bound for round shapes. An overlap counts as the deepest vertex's
-    depth, at least LEAST_OVERLAP.
+    The gap is exact between triangles, a lower bound for round shapes. An overlap is the deepest vertex's depth, at
+    least LEAST_OVERLAP.
     """
     T_a, T_b = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -187,12 +186,11 @@ class SelfSurfaces:
 
 @dataclass(frozen=True, kw_only=True)
 class KeptMargin:
-    """Two links whose spheres have an own `margin` [m] instead of the configured one.
+    """Two links whose spheres have a `margin` [m] of their own.
 
     margin: negative if the spheres may overlap; None: the configured margin stays. apart: least gap [m] of their
     surfaces (spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one link is in `fixtures`.
-    surface_gap: least gap [m] of their surfaces in sampled postures whose spheres are at least the margin apart, None
-    if unknown.
+    surface_gap: least gap [m] of their surfaces in postures whose sphere gap reaches the margin, None if unknown.
     """
 
     links: tuple[str, str]
@@ -222,12 +220,12 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
-    """Pairs whose spheres are often nearer than `margin` [m], with a lower margin for them.
+    """Pairs whose spheres are often nearer than `margin` [m], with a lower margin.
 
-    Often means in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* if the surfaces are nearer than
-    the margin and than half their largest gap. The lower margin is the sphere gap that nearly all other postures
-    exceed. It rises to the largest sphere gap of near postures, if most other postures exceed that one. With unknown
-    surfaces no posture is near, and the margin is at least 0.
+    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* if the surfaces are nearer than the
+    margin and half their largest gap. The lower margin is the sphere gap that nearly all other postures exceed. It
+    rises to the largest gap of near postures, if most others exceed that. With unknown surfaces no posture is near,
+    and it is at least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

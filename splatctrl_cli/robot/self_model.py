@@ -19,12 +19,12 @@ BOUNDS = ("start_ns", "end_ns", "first_ns")  # missing from files of earlier ver
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLink:
-    """A link's parts beyond its visual surface: permanent ones, or a grasped object.
+    """A link's parts beyond its visual surface: permanent, or a grasped object.
 
     They last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's centre;
     voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8: number with a surface;
     triangles (F, 3, 3) [m], link frame: the parts' closed surfaces. outside_95, outside_most [m]: protrusion of 95 %
-    of their cells, and the largest, at place (3,) [m]; since [s]: from the first frame until the parts were knowable.
+    of their cells, and the largest, at place (3,) [m]; since [s]: from the first frame until they were knowable.
     Without parts, protrusions are 0, place and since NaN. first_ns [ns]: first frame.
     """
 

@@ -63,7 +63,7 @@ def add_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet
 
 
 def match_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """Spheres by the URDF's link names, and left-out links that it does not have.
+    """Spheres by the URDF's link names, and other links, whose spheres are left out.
 
     If no name agrees, names are compared without their first part: `panda_link1` fits `fr3_link1`. Raises InputError
     about `name` if nothing fits.
@@ -96,9 +96,9 @@ def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
     """Bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    In each body's frame, the sphere's centre stays within a ball. At each revolute joint towards the base, the ball
-    grows by its centre's distance from the axis; the bound is the ball's radius then. A prismatic joint's bound is 1.
-    It is 0 if the joint does not move the sphere.
+    In each body's frame, the sphere's centre stays within a ball. At a revolute joint, the ball grows by its centre's
+    distance from the axis, and its radius is the bound. A prismatic joint has the bound 1, a joint that does not move
+    the sphere 0.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -124,7 +124,7 @@ URDF_SUFFIXES = (".urdf", ".xml")
 
 @dataclass(frozen=True, kw_only=True)
 class SphereFile:
-    """A sphere file: layout (such as "cuRobo YAML"), spheres, number of spheres switched off."""
+    """A sphere file: layout (such as "cuRobo YAML"), spheres, number switched off."""
 
     path: Path
     layout: str
@@ -133,7 +133,7 @@ class SphereFile:
 
 
 def read_spheres(path: Path) -> SphereSet:
-    """Spheres of a file [m]; see `read_sphere_file`."""
+    """Spheres of a file [m] (`read_sphere_file`)."""
     return read_sphere_file(path).spheres
 
 

@@ -6,9 +6,8 @@ covers patch p protrudes by
 
     K[c, p] = max_k |v_pk - c| + d(c).
 
-The best n centres solve a k-centre problem: each patch takes its least K over centres, and the largest of these is
-minimal. Greedy set cover at a bisected t gives centres, which alternating assignment and recentring improve; then
-balls shrink.
+The best n centres minimise the largest of the patches' least K, a k-centre problem. Greedy set cover at a bisected t
+gives centres, which alternating assignment and recentring improve; then balls shrink.
 """
 
 import hashlib
@@ -181,7 +180,7 @@ class _Link:
     def cover(self, t: float, *, at_most: int) -> Index | None:
         """Candidates (n,) whose balls of protrusion t cover every patch, by greedy passes.
 
-        None if more than `at_most` are needed, or if t is too small for a patch.
+        None if that takes more than `at_most`, or t is too small for a patch.
         """
         holds = self._cost <= t
         if not holds.any(axis=0).all():
@@ -195,7 +194,7 @@ class _Link:
         return None if best is None else np.array(best, dtype=np.int64)
 
     def within(self, max_protrusion: float) -> tuple[Float64, Float64]:
-        """Few spheres within a protrusion [m]. Raises UsageError if it is too small for a patch."""
+        """Few spheres within a protrusion [m]. Raises UsageError if too small for a patch."""
         least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
         cover = require(
             self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1]),
@@ -233,7 +232,7 @@ class _Link:
         return self._polish(centers)
 
     def round_outward(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
-        """Spheres at rounded centres, as small as patches and then the whole surface allow."""
+        """Spheres at rounded centres, as small as the whole surface allows."""
         owner, _ = self._assign(centers)
         centers = centers[np.unique(owner)].round(DIGITS)
         owner, _ = self._assign(centers)

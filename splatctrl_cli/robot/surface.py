@@ -36,9 +36,9 @@ class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
     kinds (P,), sizes (P, 3) as in `kernels.surface_image`; T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame
-    of triangle_links (F,). mesh: triangles to draw; trees: triangles to measure, by link number. by_spheres: links
-    whose missing or unreadable geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that
-    no joint moves. num_carried: number of carried boxes, whose links are repeated at the end of `links`.
+    of triangle_links (F,); mesh draws the triangles, trees (by link number) measure them. by_spheres: links whose
+    missing geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that no joint moves.
+    num_carried: number of carried boxes, whose links are repeated at the end of `links`.
     """
 
     links: tuple[str, ...]
@@ -222,8 +222,8 @@ class RobotSurface:
     ) -> Float64:
         """Signed distances (Q,) [m] of points (Q, 3), negative inside.
 
-        Triangles beyond `within` (Q,) [m] are infinitely far. With `enough` (Q,) [m] of at least 0, the result only
-        lies on the true side of `within` and of `enough`. Points `outside` (Q,) skip the inside test.
+        Triangles beyond `within` (Q,) [m] are infinitely far. With `enough` (Q,) [m] >= 0, the result only lies on
+        the true side of `within` and `enough`. Points `outside` (Q,) skip the inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
@@ -249,7 +249,7 @@ class RobotSurface:
     def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
         """A link's signed gap (T,) [m] to the nearest ball; infinite without balls.
 
-        Carried boxes count. centers (N, 3), radii (N,) [m]: of the balls, world; T_world_link (T, 4, 4).
+        Carried boxes count. Balls: centers (N, 3), radii (N,) [m], world. T_world_link (T, 4, 4).
         """
         numbers = [number for number, name in enumerate(self.links) if name == link]
         to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)

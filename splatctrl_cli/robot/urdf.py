@@ -108,8 +108,8 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        These are several prismatic joints on one rigid body, or mimics and the joints they follow, unless they carry
-        a joint of another kind.
+        Several prismatic joints on one rigid body, or mimics and the joints they follow, if they carry no other
+        joint.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -128,7 +128,7 @@ class UrdfFile:
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
         """`grippers` that `moved` joints carry, but do not move.
 
-        They are neither before a moved joint nor linked to one by a mimic.
+        None leads to a moved joint, or shares a mimic with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
@@ -203,10 +203,7 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
 
 def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
-    """URDF in which a link's visual geometry, if any, replaces its collision geometry.
-
-    Links in `without` do not change.
-    """
+    """URDF in which visual geometry replaces collision geometry, except in links `without`."""
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
         is_seen = link.get("name") not in without
