@@ -105,7 +105,7 @@ class NearSpace:
     ) -> Account:
         """Evidence at posture q (J,); distance: to the map's surfaces."""
         centers, voxels = self._model.sphere_centers(q), fixed.NEAR_LATTICE / known.voxel
-        # A multiple or a part of a voxel.
+        # The step is a multiple of a voxel, or an integer fraction.
         step = float(known.voxel * np.ceil(voxels - 1e-6) / np.ceil(1 / voxels - 1e-6))
         points = self._lattice(known.origin, step, centers)
         gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)

@@ -23,7 +23,7 @@ from splatctrl_cli.records import Float64
 
 PERSON_SPEED = 1.6  # [m/s] of v_h where it is not measured, by the standard and ISO 13855
 STANDING = 1e-3  # of an axis's speed limit, below which it stands still
-SCALE_STEPS = 20  # halvings of the interval of a speed scale: 1e-6
+SCALE_STEPS = 20  # halvings of a speed scale's interval, down to 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)

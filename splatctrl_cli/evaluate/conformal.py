@@ -2,7 +2,7 @@
 
 A frame set's miss is its largest distance from held-out points to the map. Frame sets form stretches, as long as the
 misses' autocorrelation time and as far apart; a stretch's score is its largest miss. If n scores and a new one are
-exchangeable, the k-th smallest bounds the new one with probability at least `confidence`, for
+exchangeable, the k-th smallest bounds the new one with probability at least `confidence`. There,
 ``k = ceil((n + 1) * confidence)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
 The bound is for a further stretch, not each state, and not for surface without depth, or another scene or camera.

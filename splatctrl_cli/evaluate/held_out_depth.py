@@ -78,7 +78,7 @@ def cloud_score(
 
 def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
     some, others = (p[:: max(1, len(p) // 20_000)] for p in (points, reference))
-    factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
+    factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, mistaken for each other
     fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
     refuse_if(

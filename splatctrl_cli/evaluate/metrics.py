@@ -44,7 +44,7 @@ ERROR = Scale(unit="m", better=Better.LOWER, absolute=1e-3, relative=0.02)
 FAULTS = Scale(better=Better.LOWER, relative=0.05)  # 0 must stay 0; of 100, some may cross a limit
 BAD_SHARE = Scale(better=Better.LOWER, absolute=0.005, relative=0.02)
 GOOD_SHARE = Scale(better=Better.HIGHER, absolute=0.005)
-DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # as far as four seeds are apart
+DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # spread of four seeds
 SIMILARITY = Scale(better=Better.HIGHER, absolute=0.005)
 AGE = Scale(unit="s", better=Better.LOWER, absolute=0.01, relative=0.02)
 LENGTH, TIME = Scale(unit="m"), Scale(unit="s")

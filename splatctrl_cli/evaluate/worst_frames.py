@@ -83,7 +83,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
     """Write the image with the arm's silhouette, a line to the obstacle, and the caption."""
-    zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
+    zoom = max(1, -(-960 // frame.intrinsics.width))  # a picture is at least 960 px wide
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
     picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     T_camera_world = np.linalg.inv(frame.T_world_camera)

@@ -5,8 +5,7 @@ triangle's corner:
 
 max over the triangle of phi <= min_i max_k |v_k - c_i| - r_i,
 
-exact if one ball is nearest to the whole triangle. Triangles are halved until this bound and the largest corner phi
-agree.
+exact if one ball is nearest throughout. Triangles are halved until this bound and the largest corner phi agree.
 Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 

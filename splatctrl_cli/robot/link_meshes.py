@@ -73,7 +73,7 @@ class MeshDistance:
         return normal
 
 
-MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: outside, it has another unit
+MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh; any other length means another unit
 LINK_LENGTHS = (0.01, 3.0)  # [m] of a link in the right unit
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 

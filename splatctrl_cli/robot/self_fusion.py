@@ -31,11 +31,11 @@ from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_diges
 from splatctrl_cli.robot.surface import RobotSurface
 
 REACH = 0.06  # [m] outside a link's visual surface: search distance for its parts
-MOST_REACH = 0.24  # [m]: its limit when parts extend as far
+MOST_REACH = 0.24  # [m]: limit of that distance, which grows while parts reach it
 STEP = 0.02  # [m] that a corner of a link's box moves between clearly different configurations
 FINE = 0.5  # of STEP, for a link that moves too little; its parts must leave their place by `AWAY`
 SAME = 0.5  # of the step, within which views of one moment share a configuration
-PATH_SHARE = 0.5  # of a link's way between two moments, which separates them even if it returned
+PATH_SHARE = 0.5  # of a link's path between two moments, which separates them even if the link returned
 AWAY = 0.04  # [m] from a cell's old place, beyond which a surface there is another object
 MOST_ASKED = 8  # configurations with places to check in the others
 MOST_LOST = 0.5  # of a piece's cells that may belong elsewhere
@@ -80,9 +80,10 @@ def learn(
 
     T_world_link (V, L, 4, 4): of the surface's links; links: all of the robot's. reach [m]: search distance outside a
     link's visual surface, doubled up to `MOST_REACH` while parts reach it. In a run of configurations, a grid cell is
-    robot if `NUM_CONFIGURATIONS` show it as surface and at most `FREE_SHARE` see through it, by most of their views.
-    It must also leave its place in the world with the link, and move against each nearer link. A link that
-    moves too little gets configurations half as far apart. Raises InputError if no link can be learned.
+    robot if `NUM_CONFIGURATIONS` show it as surface and at most `FREE_SHARE` see through it. A configuration's views
+    decide by majority. The cell must also leave its place in the world with the link, and move against each nearer
+    link. A link that moves too little gets configurations half as far apart. Raises InputError if no link can be
+    learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]

@@ -174,7 +174,7 @@ class _Link:
         self._depth = self._distance(self._candidates)
         self._cost = self._reach(self._candidates) + self._depth[:, None]
         alone = self._cost.max(axis=1)
-        self.middle = int(np.argmin(alone))  # the candidate that covers the link alone at the least protrusion
+        self.middle = int(np.argmin(alone))  # the candidate that alone covers the link, at the least protrusion
         self.single = float(alone[self.middle])
 
     def cover(self, t: float, *, at_most: int) -> Index | None:
