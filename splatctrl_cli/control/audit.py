@@ -1,7 +1,7 @@
 """Clearance of logged joint states by each field, their unknown share, and bounds between states.
 
-With d_0s, d_1s at the ends and travel up to L_s, sphere s's distance is at least ``(d_0s + d_1s - L_s) / 2``. Exact
-distance is 1-Lipschitz; L_s follows from joint motion and `RobotModel.lever_arms`.
+Between states with distances d_0s and d_1s, sphere s travels at most L_s, joint motion times `RobotModel.lever_arms`.
+Exact distance is 1-Lipschitz, and thus at least ``(d_0s + d_1s - L_s) / 2`` in between.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,12 +16,12 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import voxels_at
 
 DistanceFunction = Callable[[Float64], Float64]
-"""points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
+"""points (Q, 3) [m], world -> distance (Q,) [m], NaN where unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BallDistance:
-    """A `DistanceFunction` of balls, centers (N, 3), radii (N,) [m]."""
+    """A `DistanceFunction` to balls: centers (N, 3), radii (N,) [m]."""
 
     of_points: DistanceFunction
     centers: Floats
@@ -32,7 +32,7 @@ class BallDistance:
 
 
 DistancesAt = Callable[[int], Mapping[str, DistanceFunction]]
-"""The distances known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
+"""Stamp [ns] -> the distances known then, by name. One scene gives one object, so that its states share a query."""
 
 Observed = Callable[[Float64], UInt8]
 """points (Q, 3) [m], world -> the observed channel (Q,) uint8: 0 = never seen."""
@@ -44,7 +44,7 @@ CHUNK = 256  # states per query
 class Clearance(Columns):
     """Distance (T,) [m] of the nearest moving part, NaN if unknown; sphere (T,): its index.
 
-    For self-collision: of the nearest pair, and its index, -1 without pairs.
+    For self-collision, both are of the nearest pair; inf and -1 without pairs.
     """
 
     distance: Float64
@@ -53,11 +53,11 @@ class Clearance(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class AuditTrace:
-    """T audited states.
+    """T audited states, with values (T,).
 
-    stamp_ns (T,); position (T, J) [rad]; clearance by field; limit_margin (T,) [rad]: to the nearest position limit,
-    negative outside, at limit_joint (T,); self_clearance (T,) [m] (inf without pairs) at self_pair (T,);
-    unknown_share (T,) of sphere centres (NaN if not measured); of_spheres: clearances (T, M) [m] by field, if kept.
+    position (T, J) [rad]; clearance: by field; limit_margin [rad]: to the nearest position limit, of limit_joint,
+    negative outside; self_clearance [m]: of self_pair, inf without pairs; unknown_share: never-seen share of sphere
+    centres (NaN: not measured); of_spheres: clearances (T, M) [m] by field.
     """
 
     stamp_ns: Stamps
@@ -76,8 +76,8 @@ def part_clearances(
 ) -> tuple[Float64, Bool]:
     """Moving parts' clearances (T, M) [m] at postures (T, J); True (M,) for link surfaces.
 
-    A link's triangles decide if the scene is of balls: the link's nearest sphere has their clearance. Each other
-    sphere has the larger of that and its own less `sphere_deficit`. centers (T, S, 3) [m]: of all spheres, if known.
+    In a scene of balls, a link's triangles decide: its nearest sphere gets their clearance. Its other spheres get the
+    larger of that clearance and their own less `sphere_deficit`. centers (T, S, 3) [m]: of all spheres, if known.
     """
     moving = np.flatnonzero(model.moving_spheres)
     there = model.sphere_centers_batch(positions) if centers is None else centers
@@ -118,8 +118,8 @@ def audit(
 ) -> AuditTrace:
     """Clearances of states, by the distances known at their stamps.
 
-    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Part of the states gives that part of the audit,
-    to the bit.
+    stamps (T,) [ns] never go back; positions (T, J) finite; T >= 1. Auditing only some of the states gives
+    bit-identical results for them.
     """
     parts: dict[str, list[tuple[Clearance, Float64]]] = {}
     self_parts, unknown_parts = [], []
@@ -152,7 +152,7 @@ def observed_at(seen: UInt8, origin: Float64, voxel: float, points: Float64) -> 
 
 
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
-    """Yield ranges of at most CHUNK states in one scene; keep at most two scenes."""
+    """Yield ranges of at most CHUNK states in one scene, with two scenes in memory."""
     first, before = 0, distances_at(int(stamps[0]))
     for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))
@@ -184,7 +184,8 @@ def _unknown_share(model: RobotModel, centers: Float64, observed: Observed | Non
 class Reach:
     """Moving spheres (M,) of an arm and their travel.
 
-    radii (M,) [m], with the uncovered surface; levers (M, J) [m per rad or m]; velocity_limit (J,) [1/s].
+    radii (M,) [m]: enlarged to cover the surface; levers (M, J): travel [m] per rad or m of a joint; velocity_limit
+    (J,) [1/s].
     """
 
     moving: Integers
@@ -208,7 +209,7 @@ class Reach:
 class Between:
     """Lower bounds (T - 1,) [m] of the clearance within intervals, ends included.
 
-    Where is_met (T - 1,), lower is the clearance of a posture in between, below the margin. is_bounded (T - 1,):
+    is_met (T - 1,): lower is the clearance of a posture in between that is below the margin. is_bounded (T - 1,):
     False without a bound.
     """
 
@@ -229,11 +230,12 @@ def between_states(
     margin: float,
     longest: float,
 ) -> Between:
-    """Bounds between states (T, J) at stamps (T,) [ns] in one scene.
+    """Bound clearances between states (T, J) at stamps (T,) [ns] in one scene.
 
     at_states (T, M) [m]: moving spheres' `clearances`, infinite for intended contact. Up to `longest` [s] the arm
-    moves straight in joint space, plus any excess of its velocities (T, J). Over longer intervals it may go anywhere
-    within its velocity limits: bounded only where that stays above the margin [m].
+    moves straight in joint space, plus any travel of its velocities (T, J) beyond that motion. Over longer intervals
+    it may move anywhere within its velocity limits; that bound counts only if it reaches the margin [m], or if an end
+    is below the margin.
     """
     seconds = np.diff(stamps) * 1e-9
     motion = np.abs(np.diff(positions, axis=0))
@@ -274,8 +276,8 @@ def _refined(
 ) -> tuple[Float64, Bool]:
     """Halve K straight motions until each piece is short, or its bound reaches the margin.
 
-    Return the least bound (K,), and is_met (K,): a posture on the way is below the margin, and its least clearance
-    replaces the bound.
+    Return the least bound (K,) and is_met (K,). If is_met, a posture on the way is below the margin, and its least
+    clearance replaces the bound.
     """
     least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
@@ -307,6 +309,6 @@ def _refined(
 
 
 def clearances(model: RobotModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
-    """Moving spheres' clearances (T, M) [m], less their uncovered surface."""
+    """Moving spheres' clearances (T, M) [m], less uncovered surface where no triangles decide."""
     each, is_surface = part_clearances(model, positions, distance_to)
     return np.asarray(each - np.where(is_surface, 0.0, reach.radii - model.sphere_set.radii[reach.moving]))

@@ -1,4 +1,4 @@
-"""Barrier rows of III-E: moving spheres against the scene, pairs of spheres, people; rates dd/dt."""
+"""Barrier rows of III-E: moving spheres against scene and people, pairs of spheres; rates dd/dt."""
 
 from collections.abc import Callable
 from copy import copy
@@ -21,7 +21,7 @@ MARGIN = "margin"
 class SceneRows(BarrierTerm):
     """A row per moving sphere against a distance field's nearest surface.
 
-    Spheres in `State.by_surface` count by their link's surface where that is farther.
+    Spheres in `State.by_surface` take their link's surface distance where that is larger.
     """
 
     kind = RowKind.SCENE
@@ -40,15 +40,15 @@ class SceneRows(BarrierTerm):
         self._links = np.array(model.sphere_set.links)[self._moving]
 
     def replace_field(self, field: DistanceField, balls: BallDistance | None) -> "SceneRows":
-        """Rows in another field, of `balls` (None: links' surfaces do not count)."""
+        """Rows in another field, whose scene is `balls` (None: links' surfaces do not count)."""
         other = copy(self)
         other._field, other._balls = field, balls
         return other
 
     def raise_by_surfaces(self, q: Float64, distance: Float64, chosen: Bool, G: Float64 | None = None) -> Float64:
-        """Distances (M,) [m], for `chosen` (M,) spheres raised to their link's surface gap.
+        """Distances (M,) [m], those of `chosen` (M,) spheres raised to their link's surface gap.
 
-        Rows G (M, J) of raised spheres are replaced by the gap's, in place.
+        Rows G (M, J) of raised spheres become minus the gap's gradient, in place.
         """
         if self._balls is None or not chosen.any():
             return distance
@@ -63,7 +63,6 @@ class SceneRows(BarrierTerm):
         return distance
 
     def rows(self, state: State) -> Barrier:
-        """Rows, by one query of distance and gradient."""
         centers, jacobians = state.spheres
         distance, gradient = self._query(centers)
         G = -external_gradient(gradient, jacobians[self._moving])
@@ -74,8 +73,8 @@ class SceneRows(BarrierTerm):
     def cut(self, state: State, velocity: Float64, chosen: Integers, distance: Float64) -> Barrier:
         """Rows of `chosen` spheres against their nearest surfaces after a period of `velocity` (J,).
 
-        The distance to such a surface is linearised there: conservative for a surface convex as seen from there, such
-        as a ball. At the state it counts as at least the present `distance` (M,).
+        The distance is linearised at the period's end: conservative for a surface convex as seen from there, such as
+        a ball. At the state, it counts as at least the present `distance` (M,).
         """
         period = self._config.period
         q = state.q + period * velocity
@@ -89,7 +88,7 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def distances(self, centers: Float64) -> Float64:
-        """Distances (M,) [m]; NaN where unknown, which breaks a row's promise."""
+        """Distances (M,) [m]; NaN where unknown, which fails a step's check."""
         return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
 
     def _barrier(self, index: Integers, G: Float64, h: Float64, distance: Float64) -> Barrier:
@@ -126,7 +125,7 @@ class SelfRows(BarrierTerm):
     def rows(self, state: State) -> Barrier:
         """Rows of the pairs.
 
-        Where joints stop at once, G is zero for pairs too slow to use up h.
+        If joints stop at once, G is zero for pairs too slow to violate their row.
         """
         centers, jacobians = state.spheres
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
@@ -163,7 +162,7 @@ class SelfRows(BarrierTerm):
 def scene_margin(model: RobotModel, config: ControlConfig) -> Float64:
     """Spheres' scene margins (S,) [m]: epsilon, plus deficits if `config.coverage` is "margin".
 
-    By the triangle inequality, the surface then keeps epsilon for any 1-Lipschitz distance.
+    By the triangle inequality, the surface then stays epsilon away, for any 1-Lipschitz distance.
     """
     deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
     return config.margin + deficit
@@ -177,10 +176,10 @@ def distance_bound(
     G: Float64,
     rate: float | Float64 = 0.0,
 ) -> Float64:
-    """h (M,), with the braking distance where joints cannot stop at once.
+    """h (M,) [m/s], with room for braking if joints have an acceleration limit a (J,).
 
-    Only then G (M, J) counts. A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it counts.
-    rate [m/s]: dd/dt of a changing field.
+    Only then G (M, J) counts: a row's approach G v can be braked by at most ``|G| a``, of which BRAKING_SHARE is
+    used. rate [m/s]: dd/dt of a changing field.
     """
     if acceleration is None:
         return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
@@ -204,7 +203,7 @@ def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, ra
 
 
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> Bool:
-    """True for rows (M,) that some velocity of the box violates; others change no solution."""
+    """True for rows (M,) that some velocity of the box violates; other rows change no solution."""
     return np.asarray(np.maximum(G * lowest, G * highest).sum(axis=1) > h)
 
 
@@ -233,7 +232,7 @@ SceneStepAt = Callable[[int], SceneStep | None]
 def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
     """Rate dd/dt (Q,) [m/s] at fixed points (Q, 3) [m], from older to newer scene.
 
-    Clipped to [-limit, 0]; missing distances give 0. The past rate holds until the next scene.
+    It is clipped to [-limit, 0], 0 for missing distances, and assumed to last until the next scene.
     """
     if step is None:
         return 0.0
@@ -244,7 +243,7 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
 def rate_of(
     config: ControlConfig, model: RobotModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
 ) -> float | Float64:
-    """Configured dd/dt of the moving spheres at a posture (J,) and stamp."""
+    """Rate dd/dt [m/s] of the moving spheres at a posture (J,), 0 unless configured."""
     step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
     if step is None:
         return 0.0
@@ -253,9 +252,9 @@ def rate_of(
 
 
 class PeopleGrown:
-    """min(scene, people - extra): a field in which people extend `extra` [m] farther.
+    """A scene's field in which people extend `extra` [m] farther.
 
-    Distance and gradient are the smaller one's.
+    Distance min(scene, people - extra), with the smaller term's gradient.
     """
 
     def __init__(self, scene: DistanceField, people: DistanceField, extra: float) -> None:
@@ -274,7 +273,7 @@ class PeopleGrown:
 def guard_people(scene: DistanceField, people: DistanceField | None, config: ControlConfig) -> DistanceField:
     """Field from which a controller keeps `config.margin`.
 
-    People count as nearer by `config.human_margin` less the margin.
+    People are nearer by `config.human_margin` less the margin.
     """
     extra = config.human_margin - config.margin
     return scene if people is None or extra <= 0 else PeopleGrown(scene, people, extra)

@@ -15,7 +15,7 @@ from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64, Index, Stamps
 
 NamedColumns = Mapping[str, Any]
-"""Columns by name: arrays (T, ...) with NaN for no value, or T words or tuples of words, empty for none."""
+"""Columns by name: arrays (T, ...), NaN for no value; or T words, or tuples of words, empty for no value."""
 
 RUNGS = tuple(Rung)
 
@@ -28,7 +28,7 @@ def names_at(names: Sequence[str], index: Index) -> list[str]:
 def audit_columns(
     part: AuditTrace, spheres: Sequence[str], joints: Sequence[str], pairs: Sequence[str]
 ) -> NamedColumns:
-    """Columns of audited states; q: position (T, J); is_blank: 1 where a field has no distance."""
+    """Columns of audited states; q: position (T, J); is_blank: True where any field has no distance."""
     blank = np.any([np.isnan(nearest.distance) for nearest in part.clearance.values()], axis=0)
     columns: dict[str, Any] = {"stamp_ns": part.stamp_ns, "q": part.position, "is_blank": blank}
     for field, nearest in part.clearance.items():
@@ -56,10 +56,11 @@ def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
 
 
 def step_columns(steps: Sequence[ControlStep | None], num_joints: int) -> NamedColumns:
-    """Columns of a controller's steps, None where it had none.
+    """Columns of a controller's steps; None is a state without a step.
 
-    v (T, J) [rad/s]: velocity. rung_number: in RUNGS. position_error [m], rotation_error [rad]. shaped: as
-    `is_shaped`, NaN for an external controller. multiplier: largest of a kind. who_*: rows, the largest first.
+    v (T, J) [rad/s]: velocity. rung_number: index in RUNGS. position_error [m], rotation_error [rad]. shaped:
+    `is_shaped`, NaN for an external controller. multiplier_*: largest of a kind. who_*: rows, by falling multiplier;
+    who_relaxed: by falling slack.
     """
 
     def number(value: Callable[[ControlStep], float]) -> Float64:
@@ -152,9 +153,10 @@ SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures with shown events,
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """Nearest obstacle: distance [m] of its surface to a point; place (3,) [m], world.
+    """Nearest obstacle: distance [m] from a point to its surface; position (3,) [m], world.
 
-    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: of a grid; name: of others.
+    splat: index in its scene's file; label: the splat's, or UNREPRESENTED; cell: in a grid; name: of any other
+    obstacle.
     """
 
     distance: float
@@ -175,8 +177,8 @@ class Obstacle:
 class Event:
     """An interval of successive states with its worst value.
 
-    names: in order, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the worst state;
-    worst_name, obstacle: there.
+    names: in order, at most MAX_NAMES of num_names; source: the field, or empty; state: index of the worst value's
+    state; worst_name, obstacle: at that state.
     """
 
     kind: EventKind
@@ -199,7 +201,7 @@ class Event:
 class Signal:
     """Source of events of one kind, by state: is_on (T,), value (T,), who (T,).
 
-    who: a name, or names, the value's own first.
+    who: the value's name, or names, the value's first.
     """
 
     kind: EventKind
@@ -216,24 +218,23 @@ class Signal:
 
 
 def runs_of(is_on: Bool) -> list[tuple[int, int]]:
-    """First and one past the last index of each run of true values (T,)."""
+    """First index, and one past the last, of each run of true values (T,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_on, [False]]).astype(np.int8)))
     return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 Near = Callable[[EventKind, str, int], Obstacle | None]
-"""Kind of an event, name of its worst and at which of the states -> what is nearest there."""
+"""Kind of an event, name and state index of its worst value -> the nearest obstacle there."""
 
 
 def events_of(stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> tuple[Event, ...]:
-    """Intervals of all signals (T,), by start; near: the obstacle of a worst value."""
+    """Events of all signals (T,), by start; near: finds the obstacle of a worst value."""
     runs = [(signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
     runs.sort(key=lambda run: (stamp_ns[run[1]], -stamp_ns[run[2] - 1]))
     return tuple(_event(stamp_ns, signal, first, end, near) for signal, first, end in runs)
 
 
 def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> Event:
-    """The event of the states [first, end)."""
     values = signal.value[first:end]
     at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
     start_s, end_s, worst_s = (float(stamp_ns[i] - stamp_ns[0]) * 1e-9 for i in (first, end - 1, at))
@@ -274,7 +275,7 @@ def clearance_signals(columns: NamedColumns, source: str, margin: float) -> list
 
 
 def audit_signals(columns: NamedColumns, fields: Sequence[str], margin: float) -> list[Signal]:
-    """Signals of audited states: clearance by each field, known space, limits, self-collision."""
+    """Signals of audited states: clearance by each field, unknown space, limits, self-collision."""
     unknown, outside, touching = (columns[name] for name in ("unknown_share", "limit_margin", "self_clearance"))
     low = partial(Signal, is_high_worse=False)
     return [
@@ -299,7 +300,7 @@ def motion_signals(columns: NamedColumns, margin: float, max_map_age: float) -> 
 
 
 def step_signals(columns: NamedColumns) -> list[Signal]:
-    """Signals of a controller's steps: rows that shaped them, fallbacks, broken rows."""
+    """Signals of a controller's steps: rows that shaped them, fallbacks, violated rows."""
     rung, scale, slack = np.array(columns["rung"]), columns["scale"], columns["slack"]
     is_least, is_hold, is_outside = (rung == each for each in (Rung.MINIMUM_VIOLATION, Rung.HOLD, Rung.OUTSIDE))
     cannot_act = np.array([len(names) > 0 for names in columns["who_fixed"]])

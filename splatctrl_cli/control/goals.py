@@ -54,7 +54,7 @@ def _cap(vector: Float64, limit: float) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedMotion:
-    """T logged states: stamp_ns (T,), never going back, position, velocity (T, J) [rad, rad/s]."""
+    """T logged states: stamp_ns (T,) that never go back; position, velocity (T, J) [rad, rad/s]."""
 
     stamp_ns: Stamps
     position: FloatRows
@@ -67,7 +67,7 @@ class LoggedMotion:
     def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
         """Position and velocity (J,) at a stamp, linear between states.
 
-        Before all states it is the first; after all, the last, at rest.
+        Earlier stamps give the first state, later stamps the last position at rest.
         """
         if stamp_ns > self.last_ns:
             return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
@@ -83,7 +83,7 @@ class LoggedMotion:
 
 
 def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
-    """A frame's pose (4, 4) and motion at a posture and velocity (J,)."""
+    """Pose (4, 4) of a frame, and its `Guide`, at a posture and velocity (J,)."""
     return model.frame_pose(position, frame), Guide(
         twist=model.frame_jacobian(position, frame) @ velocity, posture=position, velocity=velocity
     )
@@ -91,9 +91,10 @@ def guided_goal(model: RobotModel, frame: str, position: Float64, velocity: Floa
 
 @dataclass(frozen=True, kw_only=True)
 class TimedPath:
-    """A timed path (W, J), at rest at each waypoint to keep straight edges.
+    """A timed path, at rest at each waypoint (W, J) to keep its edges straight.
 
-    start_time (W,) [s]; top_speed, acceleration (W - 1,): trapezoids of the share of each edge, per s and s^2.
+    start_time (W,) [s]: of each edge, and the end. top_speed [1/s], acceleration [1/s^2] (W - 1,): of a trapezoidal
+    speed, as shares of the edge.
     """
 
     waypoints: Float64
@@ -139,13 +140,13 @@ class Detour:
         return guided_goal(model, frame, position[0], velocity[0])
 
     def advance(self, seconds: float, pose_error: Float64) -> None:
-        """Run the clock, unless the frame lags by its pose error (6,)."""
+        """Advance the clock if the position part of pose_error (6,) is below `wait_distance`."""
         if float(np.linalg.norm(pose_error[:3])) < self.wait_distance:
             self.clock = min(self.clock + seconds, self.path.duration)
 
 
 PlanDetour = Callable[[int, Float64, Float64], Detour | None]
-"""A stamp [ns], the posture (J,) and the goal's pose (4, 4) -> a way there in the scene known then, or None."""
+"""Stamp [ns], posture (J,) and goal pose (4, 4) -> a path to the goal in the scene known then, or None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +181,7 @@ class TwistTrack:
         return np.concatenate([R @ twist[:3], R @ twist[3:]])
 
     def reference(self, model: RobotModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
-        """`in_world`, each part capped in norm."""
+        """`find_world_twist`, each part capped in norm."""
         return reference_velocity(
             self.find_world_twist(model, q, stamp_ns, config.twist_timeout),
             gain=1.0,
@@ -191,7 +192,7 @@ class TwistTrack:
     def goal_at(
         self, model: RobotModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
     ) -> tuple[Float64, Guide]:
-        """Frame's own pose (4, 4), moving with the twist, without a posture."""
+        """Goal: the frame's present pose (4, 4), moving with the twist; posture q (J,)."""
         return model.frame_pose(q, frame), Guide(
             twist=self.reference(model, config, q, stamp_ns), posture=q, velocity=np.zeros(len(q))
         )

@@ -40,7 +40,7 @@ class Misbehaved(Exception):  # noqa: N818  (a result, kept by name)
 
 
 class LineProcess:
-    """A process that answers lines; its lines and stored stderr are bounded."""
+    """A process that answers line by line, with bounded lines and stored stderr."""
 
     def __init__(self, command: Sequence[str]) -> None:
         """Raises OSError if it cannot start."""
@@ -60,7 +60,7 @@ class LineProcess:
     def exchange(self, line: bytes, limit: float) -> bytes:
         """Send a line and return the next one.
 
-        Raises Misbehaved without a line within `limit` [s], or at the end.
+        Raises Misbehaved without a line within `limit` [s], for an endless line, or if the process ends.
         """
         deadline = time.monotonic() + limit
         if not self._unsent:
@@ -83,7 +83,7 @@ class LineProcess:
         return f": {shown(lines[-1])}" if lines else ""
 
     def close(self) -> None:
-        """End it and its children."""
+        """End the process and its children."""
         self._selector.close()
         for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
             if stream is not None:
@@ -93,7 +93,7 @@ class LineProcess:
         self._kill()
 
     def _has_left(self, seconds: float) -> bool:
-        """True if it ends in time. It is not reaped: its number stays reserved."""
+        """True if the process ends in time. It is not reaped: its number stays reserved."""
         deadline, how = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
         while self._process.returncode is None and os.waitid(os.P_PID, self._process.pid, how) is None:
             if time.monotonic() > deadline:
@@ -146,6 +146,6 @@ class LineProcess:
 
 
 def shown(text: str) -> str:
-    """A program's words: short, on one line, without terminal controls."""
+    """Output of a program, as one short line without terminal controls."""
     printable = "".join(c if c.isprintable() else "?" for c in text[:120])
     return f"{printable} ..." if len(text) > 120 else printable

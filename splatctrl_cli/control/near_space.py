@@ -1,6 +1,6 @@
 """Camera evidence near a moving arm: each point within the margin has one class.
 
-The points form a lattice outside the robot, near its moving links' triangles, else spheres.
+The points form a lattice outside the robot, near its moving links' triangles, or a link's spheres if it has none.
 """
 
 from collections.abc import Callable
@@ -26,9 +26,9 @@ NEVER_SEEN = (
 class Seen:
     """Camera evidence at one moment.
 
-    look: points (Q, 3) [m], world -> stamps (Q,) [ns] of the last depth through or on them, -1 never, and
+    look: points (Q, 3) [m], world -> stamp (Q,) [ns] of the last depth through or on each point, -1 if never, and its
     `EvidenceClass` (Q,), `FREE` if ever seen. edges (K, 4) [m], world: centre and radius of balls into which a
-    surface may extend. origin (3,), voxel [m], shape (X, Y, Z): of the voxels; is_free (X, Y, Z): as in `SeenVoxels`.
+    surface may extend. origin (3,), voxel [m], shape (X, Y, Z): of the voxels. is_free (X, Y, Z): None if unknown.
     """
 
     look: Callable[[Float64], tuple[Index, UInt8]]
@@ -45,10 +45,10 @@ class Account:
 
     shares (C,): of points within the margin, by `EvidenceClass`. assumed: share not free, of points whose voxels
     reach into the margin. nearest (C,) [m]: each class's least distance to the arm, at places (C, 3).
-    unseen_path [m]: least length of a path from the map's surfaces by a never-seen point, unseen_path_place, to the
-    arm; blind_to_surface [m]: least distance of such a point to the surfaces, about spheres with almost only such
-    points (`NEAR_BLIND`). Infinite and NaN without any. age [s]: quantile `NEAR_FRESH_SHARE` of ages;
-    ahead [s]: to the latest view. NaN without views.
+    unseen_path [m]: shortest path from the map's surfaces to the arm through a never-seen point, unseen_path_place.
+    blind_to_surface [m]: least distance from the surfaces to a never-seen point, blind_place, near a sphere with
+    almost only such points (`NEAR_BLIND`). Without such points, distances are infinite, places NaN. age [s]: quantile
+    `NEAR_FRESH_SHARE` of ages. ahead [s]: time until the latest view. Both are NaN without views.
     """
 
     shares: Float64
@@ -64,7 +64,7 @@ class Account:
 
 
 class NearSpace:
-    """Evaluates states of a motion far enough apart in time or space."""
+    """Evaluates states of a motion that are far enough apart."""
 
     def __init__(self, model: RobotModel, margin: float, max_age: float = np.inf) -> None:
         """max_age [s]: older evidence is stale."""
@@ -79,9 +79,9 @@ class NearSpace:
         self._looked: Float64 | None = None  # centres (M, 3) of the moving spheres at the last evaluation
 
     def choose(self, stamps: Index, centers: Float64) -> dict[int, bool]:
-        """Indices of states to evaluate; True if their ages count.
+        """Indices of states to evaluate; True if the evidence's age counts.
 
-        A state is due once a sphere has moved by `NEAR_MOVED`, and (True) every `NEAR_EVERY_NS`. stamps (T,) [ns]
+        A state is chosen every `NEAR_EVERY_NS` (True), and when a sphere has moved by `NEAR_MOVED`. stamps (T,) [ns]
         never go back; centers (T, S, 3).
         """
         chosen, moving = dict[int, bool](), centers[:, self._moving]
@@ -95,7 +95,7 @@ class NearSpace:
         return chosen
 
     def postures_between(self, first: Float64, last: Float64) -> Float64:
-        """Postures (K, J) in between, so dense that no sphere moves by `NEAR_MOVED`."""
+        """Postures (K, J) between two, so dense that no sphere moves over `NEAR_MOVED`."""
         begin, end = self._model.sphere_centers_batch(np.stack([first, last]))[:, self._moving]
         num = int(np.ceil(np.linalg.norm(end - begin, axis=1).max(initial=0.0) / fixed.NEAR_MOVED))
         return np.asarray(first + (last - first) * (np.arange(1, num) / max(num, 1))[:, None])
@@ -105,7 +105,7 @@ class NearSpace:
     ) -> Account:
         """Evidence at posture q (J,); distance: to the map's surfaces."""
         centers, voxels = self._model.sphere_centers(q), fixed.NEAR_LATTICE / known.voxel
-        # A multiple or a part of a voxel.
+        # The step is a multiple of a voxel, or an integer fraction.
         step = float(known.voxel * np.ceil(voxels - 1e-6) / np.ceil(1 / voxels - 1e-6))
         points = self._lattice(known.origin, step, centers)
         gaps, spheres = self._gaps(q, centers, points, self._margin + step / 2)
@@ -154,7 +154,7 @@ class NearSpace:
         return np.asarray(origin + step * (first + np.argwhere(is_near)))
 
     def _gaps(self, q: Float64, centers: Float64, points: Float64, reach: float) -> tuple[Float64, Index]:
-        """Distance (Q,) to the moving links, infinite beyond `reach`, negative inside; nearest sphere (Q,)."""
+        """Distance (Q,) [m] to moving links, infinite beyond `reach`, negative inside; nearest moving sphere."""
         to_spheres = cdist(points, centers) - self._radii
         gaps = np.full(len(points), np.inf)
         is_inside = np.zeros(len(points), bool)
@@ -172,7 +172,7 @@ class NearSpace:
         return np.where(is_inside, -np.abs(gaps), gaps), nearest
 
     def _gap_to(self, name: str, points: Float64) -> Float64:
-        """Interpolated distance (Q,) [m] to a link's surface, good to about a millimetre nearby."""
+        """Interpolated distance (Q,) [m] to a link's surface, accurate to about a millimetre near it."""
         if name not in self._grids:
             self._grids[name] = self._grid_of(name)
         lower, values = self._grids[name]

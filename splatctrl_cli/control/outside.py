@@ -50,7 +50,7 @@ class StepClock:
         self.spent = 0.0
 
     def measure(self, exchange: Callable[[float], T]) -> T:
-        """Answer of `exchange`, which waits for a time [s]. Raises Misbehaved if it comes late."""
+        """Answer of `exchange`, a function of its time limit [s]. Raises Misbehaved if late."""
         if self._seconds > RUN_LIMIT:
             raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
         began = time.monotonic()
@@ -65,7 +65,7 @@ class StepClock:
 
 
 class Connection(Protocol):
-    """A connected controller of a user's."""
+    """A connection to a user's controller."""
 
     clock: StepClock
 
@@ -77,14 +77,14 @@ class Connection(Protocol):
 
 
 Connect = Callable[[Document], Connection]
-"""The first line (`ControllerStart`) -> a new connection. Raises InputError if it cannot start."""
+"""The first line (`ControllerStart`) -> a new connection. Raises InputError if the controller cannot start."""
 
 
 class Program(LineProcess):
     """A controller process (docs/controllers.md)."""
 
     def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
-        """Start it with the line `start`. Raises InputError if it cannot or is no controller."""
+        """Start the process and send `start`. Raises InputError if it fails or is no controller."""
         self.clock, self._num = StepClock(step_limit), 0
         with refuse_faults(
             lambda error: f"{name}: cannot be started: {getattr(error, 'strerror', None) or error}",
@@ -110,9 +110,9 @@ class Program(LineProcess):
     def velocity(
         self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
     ) -> Float64:
-        """Answer (J,) [rad/s], sending rows on request. Raises Misbehaved.
+        """Answered velocities (J,) [rad/s], sending rows on request. Raises Misbehaved.
 
-        limits (J) [rad/s]: by joint.
+        limits [rad/s]: by joint.
         """
         self._num += 1
         self.clock.spent, has_rows = 0.0, False
@@ -128,7 +128,7 @@ class Program(LineProcess):
 
 
 class RecordedCommands:
-    """A `Connection` that repeats the newest of a log's commands (T, J) [rad/s], by stamps (T,) [ns]."""
+    """A `Connection` that repeats a log's newest command; stamp_ns (T,), commands (T, J) [rad/s]."""
 
     def __init__(self, stamp_ns: Stamps, commands: Float64) -> None:
         self.clock, self._stamp_ns, self._commands = StepClock(math.inf), stamp_ns, commands
@@ -140,13 +140,13 @@ class RecordedCommands:
         return checked_velocity({"velocity": self._commands[newest].tolist()}, limits)
 
     def close(self) -> None:
-        """Do nothing; the commands are in memory."""
+        """Do nothing."""
 
 
 class OutsideController(Commander, AbstractContextManager["OutsideController"]):
-    """The `Commander` of a user's controller, or of two that agree to the bit.
+    """The `Commander` of a user's controller, or of two instances with bit-identical answers.
 
-    num_answers; seconds, slowest: total and longest time [s].
+    num_answers; seconds, slowest [s]: their total and longest time.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class OutsideController(Commander, AbstractContextManager["OutsideController"]):
         home: Float64 | None = None,
         is_twice: bool = False,
     ) -> None:
-        """name: for messages; frame, home: as `QpIkController`. Raises InputError if it cannot start."""
+        """name: for messages; frame, home: as for `QpIkController`. Raises InputError if it cannot start."""
         self.name, self.num_answers, self.seconds, self.slowest = name, 0, 0.0, 0.0
         self.failure: Failure | None = None
         self._model, self._frame = model, frame
@@ -255,7 +255,7 @@ def _question(model: RobotModel, frame: str, moment: Moment, view: View) -> Docu
 
 
 def _rows(controller: QpIkController, view: View) -> list[Document]:
-    """Scene rows, and pairs in the program; see `ClearanceRow`."""
+    """Rows of the scene, and of pairs in the program; see `ClearanceRow`."""
     rows, kinds = view.rows, controller.row_kinds
     G = np.concatenate([barrier.G for barrier in rows.barriers])
     h, distance = rows.h, rows.distance
@@ -296,7 +296,10 @@ def _document(line: bytes) -> Document:
 
 
 def checked_velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
-    """Velocities (J,) [rad/s] of an answer; limits: by joint. Raises Misbehaved if they are no possible command."""
+    """Velocities (J,) [rad/s] of an answer; limits: by joint.
+
+    Raises Misbehaved for a wrong length, or values not finite or above MAX_SPEED limits.
+    """
     values = answer.get("velocity")
     if not isinstance(values, list) or len(values) != len(limits) or any(type(v) not in (int, float) for v in values):
         got = (

@@ -25,10 +25,11 @@ NUMBERS = "fiub"  # kinds of arrays
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyAddress:
-    """A server's URL without its query, and what the query asks for.
+    """A server's URL without its query, and the query.
 
-    observed: an observation's values by key (`JOINTS`, `IMAGE` and a camera, else text), empty for the joints and all
-    images; actions: joint `VELOCITY` [rad/s] or `POSITION` [rad]; horizon: actions of a chunk to execute, 0 for all.
+    observed: an observation's values by key, empty for the joints and all images. A value is `JOINTS`, `IMAGE` and a
+    camera, or text. actions: joint `VELOCITY` [rad/s] or `POSITION` [rad]; horizon: actions of a chunk to execute, 0
+    for all.
     """
 
     url: str
@@ -67,7 +68,7 @@ def parse_address(text: str) -> PolicyAddress:
 
 
 class RecordedImages:
-    """Newest recorded colour image of each camera, as a policy's observation needs them."""
+    """Newest recorded colour image of each camera."""
 
     def __init__(self, cameras: Iterable[str], frames: Iterable[RgbdFrame]) -> None:
         """frames: by rising stamp."""
@@ -76,7 +77,7 @@ class RecordedImages:
         self._next = next(self._frames, None)
 
     def at(self, stamp_ns: int) -> Mapping[str, UInt8]:
-        """Images (SIDE, SIDE, 3) by camera, not later than a stamp [ns]; stamps never go back."""
+        """Newest image (SIDE, SIDE, 3) by camera up to a stamp [ns]; stamps never go back."""
         while self._next is not None and self._next.stamp_ns <= stamp_ns:
             self._newest[self._next.camera] = self._next.color
             self._next = next(self._frames, None)
@@ -95,7 +96,7 @@ def resize_with_pad(image: UInt8) -> UInt8:
 
 
 def pack_array(value: Any) -> Any:
-    """openpi's msgpack extension: an array or number of NumPy as a map."""
+    """NumPy array or number as a map, by openpi's msgpack extension."""
     if isinstance(value, np.ndarray) and value.dtype.kind in NUMBERS:
         return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic) and value.dtype.kind in NUMBERS:
@@ -113,10 +114,10 @@ def unpack_array(value: dict[Any, Any]) -> Any:
 
 
 class PolicyClient:
-    """A connection to a policy server, which executes its chunks of actions in order."""
+    """A connection to a policy server; its chunks of actions are executed in order."""
 
     def __init__(self, address: PolicyAddress, start: Document, step_limit: float, images: RecordedImages) -> None:
-        """Connect, and read the server's metadata. Raises InputError if it does not answer."""
+        """Connect, and read the server's metadata. Raises InputError for no answer or an unknown camera."""
         self.clock, self._address, self._images = StepClock(step_limit), address, images
         self._num_joints, self._period, self._chunk = len(start["joints"]), float(start["period"]), list[Float64]()
         self._observed = dict(address.observed) or {

@@ -1,4 +1,4 @@
-"""Conditions for running a controller; violations outside its control, such as approaching obstacles."""
+"""Conditions for running a controller, and margin violations that no controller can prevent."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ def check_free(
 ) -> None:
     """Raise NotEvaluableError for a start q (J,) in collision.
 
-    distance_to: exact distance, by which link surfaces decide (`part_clearances`).
+    distance_to: exact distance; with it, link surfaces decide (`part_clearances`).
     """
     moving, distance = sphere_clearance(model, field, q, np.asarray(model.moving_spheres))
     if distance_to is not None and (distance < 0).any():
@@ -110,7 +110,7 @@ def check_goal(model: RobotModel, T_world_goal: Float64) -> None:
 def static_violations(
     model: RobotModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
-    """Fixed spheres within the margin [m], one or (S,): mounting, not control."""
+    """Fixed spheres nearer to the scene than the margin [m], one or (S,), due to mounting."""
     if np.all(model.moving_spheres):
         return ()
     still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
@@ -130,22 +130,23 @@ def sphere_clearance(model: RobotModel, field: DistanceField, q: Float64, chosen
 
 
 WasFree = Callable[[Float64], UInt8]
-"""points (Q, 3) [m], world -> 1 (Q,) where their voxel was free in any scene before, else 0."""
+"""points (Q, 3) [m], world -> 1 (Q,) where their voxel was free in any earlier scene, else 0."""
 
 
 class FixedParts:
-    """`found`: each fixed sphere's first clearance [m], and its least, later arrivals included.
+    """First clearance of each fixed sphere, and the least with obstacles that arrived later.
 
-    A ball has arrived if none of the first scene stood within STATIC_CHANGE of it (MOUNTED_CHANGE near a mount), it
-    is nearer than the first clearance by as much, the last scene had it too, and its voxel was free in a scene
-    before: else it fills a hole of the map. A link's triangles count where they are farther away.
+    clearances: both [m], by sphere. A ball has arrived if it is over STATIC_CHANGE (MOUNTED_CHANGE near a mount) from
+    all balls of the first scene, and nearer than the first clearance by as much. The last scene had it, too, and its
+    voxel was free in an earlier one; else it fills a hole of the map. A link's triangles count where they are
+    farther.
     """
 
     def __init__(self, model: RobotModel, near: float) -> None:
-        """near [m]: spheres with less first clearance stand near their mount."""
+        """near [m]: spheres whose first clearance is less stand near their mount."""
         self._model, self._near = model, near
         self._still = np.flatnonzero(~np.asarray(model.moving_spheres))
-        self._stood = self._new = np.zeros((0, 3))  # of the first scene; arrivals in the last one
+        self._stood = self._new = np.zeros((0, 3))  # balls of the first scene; arrivals in the last scene
         names = sphere_names(model.sphere_set)
         self._names = [names[s] for s in self._still]
         self.clearances: dict[str, tuple[float, float]] = {}
@@ -173,7 +174,7 @@ class FixedParts:
     def _came(
         self, balls: BallDistance, centers: Float64, q: Float64, was_free: WasFree | None, change: Float64
     ) -> Float64:
-        """Clearance (M,) [m] of each sphere from balls that moved by over `change` (M,) [m]; infinite without any."""
+        """Clearance (M,) [m] of each sphere from balls that arrived, by its `change` (M,) [m]; else infinite."""
         model, least = self._model, np.full(len(centers), np.inf)
         radii = model.sphere_set.radii[self._still]
         away = np.linalg.norm(centers[:, None] - balls.centers, axis=2) - radii[:, None] - balls.radii

@@ -52,11 +52,11 @@ class QpSolution:
 
 
 QpSolver = Callable[[QuadraticProgram], QpSolution]
-"""A non-finite program returns unsolved; `is_solved` only if the solver reports exactly that."""
+"""A non-finite program is unsolved. `is_solved` is True only if the solver's status is exactly solved."""
 
 
 def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Residuals:
-    """A candidate's KKT residuals; infinite if it is not finite."""
+    """A candidate's KKT residuals; infinite for a non-finite candidate."""
     if not (np.all(np.isfinite(z)) and np.all(np.isfinite(multipliers))):
         return Residuals(primal=np.inf, dual=np.inf, gap=np.inf)
     Hz, Gy = program.H @ z, program.G.T @ multipliers
@@ -70,7 +70,7 @@ def residuals(program: QuadraticProgram, z: Float64, multipliers: Float64) -> Re
 
 
 def solve_clarabel(program: QuadraticProgram, *, tolerance: float | None = None) -> QpSolution:
-    """Solve by Clarabel, an interior point method; one thread, for identical bits.
+    """Solve by Clarabel, an interior point method, on one thread for identical bits.
 
     tolerance: of feasibility, gap and linear refinement (default: Clarabel's, 1e-8).
     """
@@ -111,7 +111,7 @@ DAQP_STATUS: Mapping[int, str] = {
 
 
 def solve_daqp(program: QuadraticProgram) -> QpSolution:
-    """Solve by DAQP, a dual active-set method: exact to rounding, several times faster."""
+    """Solve by DAQP, a dual active-set method: exact to rounding, several times faster than Clarabel."""
     if not is_finite(program):
         return unsolved(len(program.c), len(program.h), "NotFinite")
     arrays = (np.ascontiguousarray(a) for a in (program.H, program.c, program.G, program.h))
@@ -155,10 +155,10 @@ class Rung(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """The ladder's answer.
+    """The fallback ladder's answer.
 
     velocity (J,); slack (M,) of barrier rows; multipliers of the box (2 J,) and barrier rows (M,); solution: the
-    last one computed; num_refused: unusable solutions with slacks.
+    last one computed; num_refused: number of unusable solutions with slacks.
     """
 
     velocity: Float64
@@ -171,7 +171,7 @@ class Choice:
 
 
 def is_usable(solution: QpSolution, max_residual: float) -> bool:
-    """True for a solution reported solved whose residuals check."""
+    """True for a solution reported solved, with residuals up to `max_residual`."""
     return solution.is_solved and solution.residuals.worst <= max_residual
 
 
@@ -182,10 +182,10 @@ def descend(
     barriers: Sequence[Barrier],
     config: ControlConfig,
 ) -> Choice:
-    """The program's solution, relaxed where a slack remains, else the least violation, else standstill.
+    """Solve the program, else minimise the rows' violation, else stand still.
 
-    The program without slacks is solved first. It stands if no multiplier exceeds its row's slack cost. Programs with
-    slacks are always feasible.
+    The program without slacks is solved first. Its solution counts if no multiplier exceeds its row's slack cost.
+    Else rows get slacks, which always makes it feasible. RELAXED means that a slack remains.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver(assemble_hard(costs, *box, barriers))
@@ -219,7 +219,6 @@ def descend(
 
 
 def stand_still(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
-    """A standstill: no solution is usable."""
     return Choice(
         velocity=np.zeros(num_joints),
         rung=Rung.HOLD,
@@ -236,8 +235,8 @@ def assemble_hard(
 ) -> QuadraticProgram:
     """Program over v alone, which may be infeasible.
 
-    Rows: upper, lower box (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, it solves
-    `assemble`, too: an L1 penalty above the multipliers is exact.
+    Rows: upper, lower box limits (2 J), barriers (M). If no barrier's multiplier exceeds its slack cost, the solution
+    solves `assemble`, too: an L1 penalty above the multipliers is exact.
     """
     H, c = sum_costs(costs)
     G, h = box_rows(lowest, highest)
@@ -252,7 +251,7 @@ def assemble(
 ) -> QuadraticProgram:
     """Program over ``z = (v, s)``, always feasible.
 
-    Rows: upper, lower box (2 J), barriers (M), slack signs (M).
+    Rows: upper, lower box limits (2 J), barriers (M), ``s >= 0`` (M).
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)

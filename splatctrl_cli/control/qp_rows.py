@@ -1,7 +1,7 @@
-"""Rows of all terms at a configuration, those the program needs, and III-E as printed.
+"""Rows of all terms at a configuration, the QP's subset, and III-E as printed.
 
-``min over (v, x, e) (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e`` with x the end-effector velocity, e one
-slack per external row, of either sign, and ``x - J v`` the paper's delta_x.
+III-E: ``min over (v, x, e) (u - x)' Q (u - x) + (x - J v)' R (x - J v) + e' S e``. x is the end-effector velocity,
+``x - J v`` the paper's delta_x; e has one slack of either sign per external row.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from splatctrl_cli.robot.model import RobotModel
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Rows at one configuration (M, one barrier per term), and those the QP needs.
+    """All M rows at one configuration, and the subset that the QP needs.
 
-    First the moving spheres, then the pairs. margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not
-    fixed, and some velocity of the box violates it; cuts: further QP rows (`RowBuilder.cut`), each with the index of
-    its row.
+    barriers: one per term, first moving spheres, then pairs. margin (M,) [m]. is_fixed: no joint velocity changes the
+    row. in_qp: it is not fixed, and some velocity of the box violates it. cuts: further QP rows (`RowBuilder.cut`),
+    each with its scene row's index.
     """
 
     barriers: tuple[Barrier, ...]
@@ -57,7 +57,7 @@ class Rows:
         return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """The QP rows' values as (M,), zero elsewhere, each the largest with its cuts."""
+        """Values of all rows (M,): zero outside the QP, the largest where a row has cuts."""
         everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
         everywhere[self.in_qp] = values[:num_rows]
         if self.cuts is not None:
@@ -66,7 +66,7 @@ class Rows:
 
 
 class RowBuilder:
-    """Builds an arm's rows in a distance field; names, kinds (M,); scene: rows against it."""
+    """Builds an arm's rows in a distance field; names, kinds (M,); scene: its `SceneRows`."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class RowBuilder:
         return (self.scene, *self._others)
 
     def replace_field(self, field: DistanceField, balls: BallDistance | None) -> "RowBuilder":
-        """Rows in another field; see `SceneRows.replace_field`."""
+        """Rows in another field (`SceneRows.replace_field`)."""
         other = copy(self)
         other.scene = self.scene.replace_field(field, balls)
         return other
@@ -128,9 +128,9 @@ def assemble_printed(
 ) -> QuadraticProgram:
     """Program of III-E as printed, over ``z = (v, x, e)``.
 
-    Rows: upper, lower box (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``; other
-    rows have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of III-E, which determines all
-    seven joints.
+    Rows: upper, lower box limits (2 J), external (M), firm. An external row is ``grad d v >= -(d - epsilon) + e``;
+    other rows have no slack. weights: diagonals (6,) of Q and R; posture: "home pose bias" of III-E, which determines
+    all seven joints.
     """
     J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)
@@ -157,7 +157,7 @@ def solve_printed(
 ) -> Choice:
     """The printed program's answer if solved and checked, else standstill.
 
-    The paper has no second rung. slack is ``-e``; a row may also demand more than it needs.
+    The paper has no second rung. slack is ``max(-e, 0)``; a positive e tightens its row.
     """
     external, *firm = barriers
     J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)

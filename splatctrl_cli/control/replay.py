@@ -1,4 +1,4 @@
-"""Open loop along a log, closed loop to a goal, in the scene known then."""
+"""Open loop along a log, closed loop to a goal, in each stamp's scene."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,9 +47,9 @@ class Waypoint:
 class ReplayTask:
     """Start (J,) [rad] at a stamp [ns] and goal pose (4, 4) of a frame.
 
-    home (J,) [rad]: posture to lean to (None: the model's `middle`). via: poses to reach first, in order. follow: the
-    goal is each time's logged pose, until the log ends. twists: velocity to reach instead, until end_ns. anchors: the
-    arm is put back into the logged posture every anchor_period [s].
+    home (J,) [rad]: posture to lean to (None: `model.middle`). via: poses to reach first, in order. follow:
+    motion whose pose at each time is the goal, until it ends. twists: velocities to reach instead of poses, until
+    end_ns. anchors: motion into whose posture the arm is put back every anchor_period [s].
     """
 
     start: Float64
@@ -66,7 +66,7 @@ class ReplayTask:
 
     @property
     def last_ns(self) -> int | None:
-        """Last stamp; None where the task ends at a goal."""
+        """Last stamp; None if the task ends at a goal."""
         if self.twists is not None:
             return self.end_ns
         return None if self.follow is None else self.follow.last_ns
@@ -76,8 +76,8 @@ class ReplayTask:
 class ReplayTrace:
     """T steps with stamp_ns (T,) and position (T, J) [rad] before each.
 
-    anchored: steps before which the arm was put back; num_reached: goals; detours: steps after which a planned detour
-    began; by_surface: spheres that finally counted by their link's surface.
+    anchored: steps before which the arm was put back; num_reached: number of goals; detours: steps after which a
+    planned detour began; by_surface: spheres that counted by their link's surface at the end.
     """
 
     stamp_ns: Stamps
@@ -107,9 +107,10 @@ def closed_loop(
     """Integrate the commander's velocities at `config.period` until goal, stall or `config.max_time`.
 
     field_at: field known at a stamp [ns], one object per scene; scene_step_at: for `config.distance_rate`;
-    plan_detour: way out of a stall, `config.max_detours` times; record: of steps, None for memory; distance_to: for
-    `check_free`; balls_at: of a stamp's field, None where links' surfaces do not count. Raises InputError for a start
-    outside the limits or an unreachable goal, NotEvaluableError for a start in collision or outside the field.
+    plan_detour: path out of a stall, up to `config.max_detours` times; record: of steps (None: in memory);
+    distance_to: for `check_free`; balls_at: the field's balls, None where links' surfaces do not count. Raises
+    InputError for a start outside the limits or an unreachable goal, NotEvaluableError for a start in collision or
+    outside the field.
     """
     field = field_at(task.stamp_ns)
     q = checked_posture(model, task.start, what="start")
@@ -185,7 +186,7 @@ class _Course:
         self.num_steps = max(round(left / config.period), 1)
 
     def anchor(self, index: int, stamp_ns: int) -> tuple[Float64, Float64] | None:
-        """Logged position and velocity (J,) at each later anchor period, until the log ends."""
+        """Logged position and velocity (J,) if an anchor is due at this step, else None."""
         task = self._task
         num_steps = max(round(task.anchor_period / self._config.period), 1)
         is_due = task.anchor_period > 0 and index > 0 and index % num_steps == 0
@@ -201,7 +202,7 @@ class _Course:
         return Outcome.STALLED if self.has_stalled(stamp_ns, index, q) else None
 
     def has_stalled(self, stamp_ns: int, index: int, q: Float64) -> bool:
-        """True at a standstill before the goal without a planned detour; starts one if possible.
+        """True at a standstill before the goal, unless a planned detour begins.
 
         A run that ends with its log never stalls.
         """
@@ -235,7 +236,7 @@ class _Course:
         )
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
-        """True at the last goal; an earlier one advances to the next. Twists have none."""
+        """True at the last goal; after an earlier goal, the next begins. Twists have none."""
         if self._detour is not None:
             self._detour.advance(self._config.period, step.pose_error)
             self._detour = None if self._detour.is_over else self._detour
@@ -252,9 +253,9 @@ class _Course:
 def divergence(
     model: RobotModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> dict[str, Float64]:
-    """Distances of T postures (T, J) from those logged at their stamps, as columns.
+    """Distances of postures (T, J) from the postures logged at their stamps (T,), as columns.
 
-    Joint norm [rad], frame position [m] and rotation [rad and degrees], each (T,); NaN after the log's end.
+    Columns (T,): joint norm [rad], frame position [m] and rotation [rad and degrees]; NaN after the log's end.
     """
     joints, linear, angular = (np.full(len(stamp_ns), np.nan) for _ in range(3))
     for index in np.flatnonzero(stamp_ns <= motion.last_ns):
@@ -277,7 +278,7 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
 
 
 def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
-    """True if joints averaged below `stall_speed` over `stall_time` (a local minimum)."""
+    """True if each joint's mean speed over `stall_time` is below `stall_speed` (a local minimum)."""
     num_back = round(config.stall_time / config.period)
     if len(positions) <= num_back:
         return False
@@ -288,7 +289,7 @@ def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:
 class OpenLoopTask:
     """Goal at each state: logged motion, a frame's pose (4, 4), or logged twists.
 
-    home (J,) [rad]: the preferred posture with a goal pose (None: the model's `middle`).
+    home (J,) [rad]: posture to lean to with a goal pose (None: `model.middle`).
     """
 
     frame: str
@@ -310,9 +311,9 @@ def open_loop(
 ) -> NamedColumns:
     """Ask the commander at every logged state, in the field known then; nothing is integrated.
 
-    has_distance (T,): False skips a state. scene_step_at: as in `closed_loop`. Returns `step_columns`, and by state:
-    logged, dv (commanded less logged) (T, J) [rad/s]; velocity_difference: its norm, largest_difference: of a joint;
-    the room that the logged velocity left, as in `VelocityMargin`.
+    has_distance (T,): False skips a state. scene_step_at: for `config.distance_rate`. Returns `step_columns`, and:
+    logged (T, J) [rad/s]; dv (T, J) [rad/s], commanded less logged velocity; velocity_difference, its norm;
+    largest_difference, its largest joint; the logged velocity's `VelocityMargin`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home)

@@ -1,4 +1,4 @@
-"""Protective separation distance of ISO/TS 15066:2016, 5.5.4.2.3 (now in ISO 10218-2:2025), and its declared inputs.
+"""Protective separation distance of ISO/TS 15066:2016, 5.5.4.2.3 (now in ISO 10218-2:2025).
 
     S_p = S_h + S_r + S_s + C + Z_d + Z_r                                                          (1)
 
@@ -23,7 +23,7 @@ from splatctrl_cli.records import Float64
 
 PERSON_SPEED = 1.6  # [m/s] of v_h where it is not measured, by the standard and ISO 13855
 STANDING = 1e-3  # of an axis's speed limit, below which it stands still
-SCALE_STEPS = 20  # halvings of the interval of a speed scale: 1e-6
+SCALE_STEPS = 20  # halvings of a speed scale's interval, down to 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class Stopping(Protocol):
 class Deceleration:
     """A stop on the path: the fastest sphere slows by `deceleration` [m/s^2], the declared worst case.
 
-    T_s = v / a and S_s = v^2 / (2 a) for that sphere; each other one travels in proportion to its speed.
+    T_s = v / a and S_s = v^2 / (2 a) for that sphere; each other sphere travels in proportion to its speed.
     """
 
     deceleration: float
@@ -88,7 +88,7 @@ class Deceleration:
 
 @dataclass(frozen=True, kw_only=True)
 class StopRow:
-    """Declared stops of one axis at an extension and payload, as shares of the largest.
+    """Declared stops of one axis at an extension and payload, both shares of the largest.
 
     speed (K,): shares of the axis's limit, rising to 1; time (K,) [s], distance (K,) [rad or m].
     """
@@ -103,8 +103,8 @@ class StopRow:
     def at(self, share: Float64) -> tuple[Float64, Float64]:
         """Time (T,) and distance (T,) at shares (T,) of the speed limit.
 
-        Distances are linear between the rows, which exceeds v^2. Times are at least the first row's. Past the limit
-        they grow with v and v^2.
+        Distances are linear between declared speeds, which exceeds v^2. Times are at least the first, 0 at
+        standstill. Above the limit, times grow with v, distances with v^2.
         """
         over = np.maximum(share, 1.0)
         time = np.where(share > STANDING, np.interp(share, self.speed, self.time), 0.0)
@@ -115,7 +115,7 @@ class StopRow:
 class StopTable:
     """Declared stops by joint, rows by rising extension; the next larger extension counts.
 
-    A sphere's travel adds those of all axes, each on its circle: their stops need not keep the path.
+    A sphere's travel is the sum of its arcs about all axes: independent stops leave the path.
     """
 
     rows: Sequence[Sequence[StopRow]]
@@ -134,7 +134,7 @@ class StopTable:
 
 @dataclass(frozen=True, kw_only=True)
 class Travel:
-    """Motion until the arm stands: person (T,), reaction and stopping (T, M) [m], which is S_h, S_r and S_s."""
+    """Motion until the arm stands: person S_h (T,), reaction S_r and stopping S_s (T, M) [m]."""
 
     person: Float64
     reaction: Float64
@@ -163,7 +163,7 @@ class Approach:
         )
 
     def speed_scale(self, motion: ArmMotion, room: Float64) -> Float64:
-        """Largest scales (T,) at which no sphere travels more than its room (T, M) [m]; else 0."""
+        """Largest scales (T,) at which no sphere's `travel` exceeds its room (T, M) [m]; else 0."""
         scale = np.zeros(len(room))
         for step in (1.0, *(0.5**k for k in range(1, SCALE_STEPS + 1))):
             tried = np.minimum(scale + step, 1.0)
@@ -171,7 +171,7 @@ class Approach:
         return scale
 
     def time_to_contact(self, motion: ArmMotion, separation: Float64) -> Float64:
-        """Least time (T,) [s] in which person and arm, at their speeds, close a separation (T, M) [m]."""
+        """Least time (T,) [s] for person and arm to close a separation (T, M) [m]."""
         return np.asarray(np.min(np.maximum(separation, 0.0) / (self.person_speed + motion.approach), axis=1))
 
 
@@ -219,7 +219,7 @@ class DeclaredSeparation:
     stops: tuple[StopRow, ...] = field(default=())
 
     def stopping(self, axes: Sequence[str]) -> Stopping:
-        """The arm's stops; a table's rows are those of the next larger payload."""
+        """The arm's stops; in a table, the rows of the next larger payload count."""
         if self.deceleration is not None:
             return Deceleration(deceleration=self.deceleration)
         payloads = sorted({row.payload for row in self.stops})
@@ -231,9 +231,9 @@ class DeclaredSeparation:
 def read_separation(path: Path, axes: Sequence[str]) -> DeclaredSeparation:
     """Read the declared inputs.
 
-    axes: the robot's joints; a stop table must have all.
-    Raises InputError for a missing file; UsageError for other text than TOML, an unknown or missing key, a value out
-    of range, or a stop table that is incomplete or falls with the speed.
+    axes: the robot's joints.
+    Raises InputError for a missing file; UsageError for text that is not TOML, an unknown or missing key, or a value
+    out of range. A stop table must be complete for all axes, and rise with the speed.
     """
     faults = (tomllib.TOMLDecodeError, UnicodeDecodeError)
     with refuse_faults(f"{path}: not valid TOML", *faults, remedy=REMEDY, error=UsageError):

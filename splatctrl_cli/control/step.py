@@ -28,12 +28,12 @@ from splatctrl_cli.control.terms import (
 from splatctrl_cli.records import Bool, DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 
-RELAXED_NEAR = 2.0  # [margins]: beyond, slack costs speed of approach, and every state's distance is judged
+RELAXED_NEAR = 2.0  # [margins]: farther away, slack allows only a faster approach, and every distance is judged
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowSlack:
-    """A barrier row relaxed by `slack` [m/s]; is_near: at most `RELAXED_NEAR` of its margins away."""
+    """A barrier row relaxed by `slack` [m/s]; is_near: its distance is at most `RELAXED_NEAR` margins."""
 
     name: str
     slack: float
@@ -51,9 +51,9 @@ class Intervention:
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityMargin:
-    """Room of a joint velocity; negative where it breaks the named row.
+    """Room of a joint velocity in its tightest rows, negative if it violates them.
 
-    barrier: least ``h - G v`` [m/s]; limit: least distance to the limits' box [rad/s].
+    barrier: least ``h - G v`` [m/s]; limit: least distance to the joint limits' box [rad/s].
     """
 
     barrier: float
@@ -66,11 +66,12 @@ class VelocityMargin:
 class ControlStep:
     """The controller's decision at one configuration.
 
-    velocity (J,) [rad/s], scaled by `scale` (1 unless the next distance broke a row's promise); pose_error (6,) [m,
-    rad]; clearance [m] of the nearest moving sphere by the controller's field; self_clearance [m] (inf without
-    pairs); violated_fixed: rows that no joint velocity changes, fixed_distance [m]: their least (inf without any);
-    interventions: rows that shape the solution; num_rows: in the QP; residual: worst KKT residual of the last
-    solution, with its status; num_refused: unusable solutions; by_surface: as in `step`, from now on.
+    velocity (J,) [rad/s], scaled by `scale` (below 1 if a distance after the step would be too small);
+    pose_error (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's field; self_clearance [m]
+    (inf without pairs); violated_fixed: violated rows that no joint velocity changes; fixed_distance [m]: their least
+    distance (inf without any); interventions: rows that shape the solution; num_rows: in the QP; residual, status:
+    worst KKT residual and status of the last solution; num_refused: number of unusable solutions; by_surface: for the
+    next `step`.
     """
 
     velocity: Float64
@@ -99,7 +100,7 @@ class ControlStep:
 class Moment:
     """A controller's input: the stamp [ns] and `QpIkController.step`'s arguments.
 
-    by_surface: of the step before.
+    by_surface: from the step before.
     """
 
     stamp_ns: int
@@ -134,9 +135,9 @@ class QpIkController:
         solver: QpSolver | None = None,
         terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad]: posture to lean to with free motion (default: `middle`); terms: added to the paper's.
+        """home (J,) [rad]: posture to lean to (default: `model.middle`); terms: added to the paper's.
 
-        Raises InputError for a robot that no controller can run with.
+        Raises InputError for a robot without moving spheres, velocity limits or required coverage.
         """
         check_model(model)
         check_coverage(model, config)
@@ -154,7 +155,7 @@ class QpIkController:
         self._reach_weight = eliminated_weight(*configured_weights(config))
 
     def replace_field(self, field: DistanceField, balls: BallDistance | None = None) -> "QpIkController":
-        """Controller on a newer field; see `SceneRows.replace_field`."""
+        """Controller on a newer field (`SceneRows.replace_field`)."""
         other = copy(self)
         other._builder = self._builder.replace_field(field, balls)
         return other
@@ -171,10 +172,10 @@ class QpIkController:
     ) -> ControlStep:
         """Joint velocity at q (J,) [rad] towards a goal pose (4, 4).
 
-        distance_rate: dd/dt [m/s] of the moving spheres' distances, (M,) or one number. guide: the goal's motion
-        (None: at rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts).
-        by_surface: spheres that count by their link's surface; one whose row would relax joins if that is farther.
-        Raises InputError for a non-finite q, NotEvaluableError where the field has no distance.
+        distance_rate: dd/dt [m/s] of the moving spheres, (M,) or one number. guide: the goal's motion (None: at
+        rest). last_velocity (J,) [rad/s]: for acceleration and smoothness (None: neither counts). by_surface: spheres
+        that count by their link's surface; with a relaxed row, a sphere joins them if that surface is farther. Raises
+        InputError for a non-finite q, NotEvaluableError where the field has no distance.
         """
         moment = Moment(
             stamp_ns=0,
@@ -223,9 +224,9 @@ class QpIkController:
         return View(error=error, state=state, rows=self._builder.at(state))
 
     def take_velocity(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
-        """An external velocity (J,) [rad/s] as a step; slack is its row violation.
+        """Step of an external velocity (J,) [rad/s]; slack is its row violation.
 
-        None: the arm stops, with the reason in `status`.
+        Without a velocity the arm stops, for the reason in `status`.
         """
         rest, rows = self._limits.rest(view.state.last_velocity), view.rows
         J, M = len(rest), int(rows.in_qp.sum())
@@ -242,7 +243,7 @@ class QpIkController:
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
         """Room that any joint velocity (J,) [rad/s] leaves at q (J,).
 
-        Acceleration does not count. Raises as `step`.
+        The change of velocity does not count. Raises the errors of `step`.
         """
         q = checked_posture(self._model, q)
         lowest, highest = self._limits.box(q)
@@ -258,9 +259,9 @@ class QpIkController:
         )
 
     def _descend(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
-        """Rows, the ladder's choice, and True if the later distances keep the promise.
+        """Rows, the ladder's choice, and True if no distance after the step is too small.
 
-        A sphere that would meet another surface than its row's adds a row. Then the ladder runs again: cutting
+        A sphere that would meet another surface than its row's gets a further row, and the ladder runs again: cutting
         planes, at most `config.max_cuts` rounds.
         """
         num_external, max_cuts = len(self._builder.scene.names), self._config.max_cuts
@@ -285,11 +286,11 @@ class QpIkController:
         return np.asarray(scene.raise_by_surfaces(state.q, distance, has_given_way & ~state.by_surface) > distance)
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
-        """True for rows (M,) whose `later` distance, a period on, breaks their promise.
+        """True for rows (M,) whose `later` distance, after a period, is less than predicted.
 
-        A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
-        Beyond the margin `promise_tolerance` applies; within it a hundredth. Rows within their margins may lose
-        ground if the total shortfall shrinks.
+        A row predicts ``d(q + dt v) >= d - dt (h + s)``; d suffices if it is less. The tolerance is
+        `promise_tolerance` outside the margin, and WITHIN_SHARE of it within. Distances within the margin may shrink
+        if the rows' total shortfall shrinks.
         """
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
@@ -303,7 +304,7 @@ class QpIkController:
         return np.asarray(broken)
 
     def _kept_scale(self, state: State, choice: Choice, rows: Rows, rest: Float64) -> float:
-        """Largest of STEP_SCALES that keeps the promises, else 0."""
+        """Largest of STEP_SCALES at which no row is `_broken`, else 0."""
         if choice.rung is Rung.HOLD:
             return 0.0
         for scale in fixed.STEP_SCALES:

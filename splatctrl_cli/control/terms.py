@@ -35,11 +35,11 @@ FR3_JOINTS = (  # v_max [rad/s], v_0 [rad/s], k [rad/s^2], q_lower [rad], q_uppe
 
 
 VelocityLimits = Callable[[Float64], tuple[Float64, Float64]]
-"""q (J,) [rad] -> lowest and highest velocity (J,), (J,) [rad/s] there; zero lies between."""
+"""q (J,) [rad] -> lowest and highest velocity (J,), (J,) [rad/s] there; zero lies between them."""
 
 
 def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
-    """Limits of the FR3's joints by position, matched by the ends of their names.
+    """Velocity limits of the FR3's joints by position, matched by the ends of their names.
 
     Raises UsageError for other names or duplicates.
     """
@@ -63,15 +63,15 @@ def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
 
 
 def braking_speed(room: Float64, gain: float, deceleration: Float64, period: float) -> Float64:
-    """Highest speed (M,) into room (M,) that never requires harder braking later.
+    """Highest speed (M,) into room (M,) that never requires harder braking than a (M,) later.
 
-    Up to ``v = a / alpha`` the linear bound ``alpha r`` needs at most the deceleration a (M,), inf without a limit.
-    Faster, the room must hold the way to that speed, and one period more:
+    Up to ``v = a / alpha`` the linear bound ``alpha r`` needs at most the deceleration a, inf without a limit. A
+    higher speed needs room to brake to ``a / alpha``, and for one period more:
 
         r(v) = a / alpha^2 + (v^2 - a^2 / alpha^2) / (2 a) + (v - a / alpha) dt,
 
-    continuous at a / alpha. Along it ``r(v - a dt) <= r(v) - v dt``: after a step at v, the room left allows v - a
-    dt. Never above ``alpha r``; equal to it where r < 0.
+    continuous at ``a / alpha``. Because ``r(v - a dt) <= r(v) - v dt``, the room after a step at v allows v - a dt.
+    The speed is at most ``alpha r``, and equal where r < 0.
     """
     linear = gain * room
     knee = deceleration / gain
@@ -87,9 +87,9 @@ def braking_speed(room: Float64, gain: float, deceleration: Float64, period: flo
 
 @dataclass(frozen=True, kw_only=True)
 class JointLimits:
-    """Limits of J joints: lower, upper [rad], velocity [rad/s], acceleration [rad/s^2] (None: none).
+    """Limits of J joints: lower, upper [rad], velocity [rad/s], acceleration [rad/s^2] (None: no limit).
 
-    gain [1/s]: of position limits; period [s]: of one velocity; by_position: further velocity limits.
+    gain [1/s]: of position limits; period [s]: of one velocity; by_position: further velocity limits, by q.
     """
 
     lower: Float64
@@ -120,7 +120,8 @@ class JointLimits:
         """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
         Without last_velocity the acceleration limit does not count. It gives way where it contradicts velocity or
-        position limits, so that the box is never empty. In states that this box led to, only by_position can do that.
+        position limits, so that the box is never empty. In states that this box led to, it gives way only to
+        by_position.
         """
         lowest, highest = velocity_box(
             q, self.lower, self.upper, self.velocity, self.gain, acceleration=self.acceleration, period=self.period
@@ -134,7 +135,7 @@ class JointLimits:
         return (np.clip(last_velocity - change, lowest, highest), np.clip(last_velocity + change, lowest, highest))
 
     def rest(self, last_velocity: Float64 | None) -> Float64:
-        """Standstill (J,) [rad/s]: zero, or the nearest that the acceleration allows."""
+        """Standstill (J,) [rad/s]: zero, or the nearest velocity that the acceleration allows."""
         if self.acceleration is None or last_velocity is None:
             return np.zeros(len(self.lower))
         change = self.acceleration * self.period
@@ -153,9 +154,9 @@ def velocity_box(
 ) -> tuple[Float64, Float64]:
     """Lowest and highest joint velocity (J,), (J,) [rad/s] at q.
 
-    III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, alpha the gain [1/s]; with an
-    acceleration (J,) [rad/s^2], `braking_speed` of that room. For q outside its limits, the box demands the way back,
-    at most at the velocity limit.
+    III-E: ``v <= alpha (q_max - q)``, ``v >= -alpha (q - q_min)``, ``|v| <= v_max``, with the gain alpha [1/s]. An
+    acceleration (J,) [rad/s^2] replaces the first two by `braking_speed`. For q outside its limits, the box demands
+    motion back, up to the velocity limit.
     """
     above, below = upper - q, q - lower
     if acceleration is None:
@@ -186,9 +187,9 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
 
 @dataclass(frozen=True, kw_only=True)
 class Strain:
-    """Largest velocity (T,) as a share of its joint's limit, at joint (T,); likewise acceleration.
+    """Largest velocity and acceleration (T,) as shares of their joints' limits.
 
-    Acceleration: 0 without a limit.
+    velocity_joint, acceleration_joint (T,): these joints. acceleration: 0 without a limit.
     """
 
     velocity: Float64
@@ -200,8 +201,8 @@ class Strain:
 class MotionLimits:
     """A motion's velocities and accelerations as shares of limits, less encoder error.
 
-    Velocities since the last state and over `MOTION_WINDOW`; accelerations from three places `MOTION_WINDOW` apart. A
-    sample covers the time before it.
+    Velocities are averaged since the last state and over `MOTION_WINDOW`, accelerations over three positions
+    `MOTION_WINDOW` apart. A sample covers the time before it.
     """
 
     def __init__(self, velocity_limit: Float64, acceleration_limit: Float64 | None) -> None:
@@ -240,7 +241,7 @@ class MotionLimits:
         )
 
     def _accelerations(self, stamps: Stamps, all_stamps: Stamps, everything: Float64) -> Float64:
-        """(T, J) [1/s^2], less encoder error; 0 while the motion is too short."""
+        """Accelerations (T, J) [1/s^2], less encoder error; 0 until the motion is two windows long."""
         seconds = (all_stamps - all_stamps[0]) * 1e-9
         now = (stamps - all_stamps[0]) * 1e-9
         accelerations = np.zeros((len(stamps), everything.shape[1]))
@@ -260,11 +261,12 @@ NO_SPHERE: Bool = np.zeros(1, dtype=np.bool_)  # among the moving spheres
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A step's state, as terms see it.
+    """A step's state, the input of its terms.
 
-    q (J,) [rad]; box: allowed velocities (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s] of `frame`; guide: the
-    goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate: dd/dt [m/s] of the
-    moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's surface.
+    q (J,) [rad]; box: lowest, highest velocity (J,), (J,) [rad/s]; reference (6,) [m/s, rad/s]: desired twist of
+    `frame`; guide: the goal's motion (None: at rest); last_velocity (J,) [rad/s] (None: unknown); distance_rate:
+    dd/dt [m/s] of the moving spheres, (M,) or one number; by_surface (M,): spheres that count by their link's
+    surface.
     """
 
     model: RobotModel
@@ -295,7 +297,7 @@ CostTerm = Callable[[State], Cost]
 def lean_home(state: State, *, home: Float64, gain: float, weight: float) -> Cost:
     """Home bias of III-E, which makes a redundant arm's QP strictly convex.
 
-    It leads to home (J,) [rad], or to the guide's posture and motion.
+    It leads to home (J,) [rad], or to the posture and motion of a guide.
     """
     if state.guide is None:
         return stray_cost(gain * (home - state.q), weight)
@@ -330,7 +332,7 @@ def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float
 
 
 def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
-    """Cost ``(u - J v)' W (u - J v)`` of missing velocity u: first two terms of III-E.
+    """Cost ``(u - J v)' W (u - J v)`` of deviation from twist u: first two terms of III-E.
 
     jacobian (6, J); u (6,) [m/s, rad/s], world; weight (6,): diagonal of W.
     """
@@ -339,7 +341,7 @@ def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
 
 
 def stray_cost(velocity: Float64, weight: float) -> Cost:
-    """Cost ``weight |v - velocity|^2`` of leaving a joint velocity (J,) [rad/s]."""
+    """Cost ``weight |v - velocity|^2`` of deviation from a joint velocity (J,) [rad/s]."""
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
 
 
@@ -363,9 +365,9 @@ class RowKind(StrEnum):
 class Barrier(Columns):
     """M barrier rows ``G v - s <= h``, with ``G = -dd/dq`` (M, J).
 
-    ``h = alpha (d - epsilon) + dd/dt`` (M,), less where joints cannot stop at once (`barriers.distance_bound`);
-    distance d (M,) [m]; index (M,): among names (spheres, or pairs). Slack costs ``slack_cost * s + slack_weight *
-    s^2`` per row [s in m/s].
+    ``h = alpha (d - epsilon) + dd/dt`` (M,) [m/s], or less with an acceleration limit (`barriers.distance_bound`);
+    distance d (M,) [m]; index (M,): among the term's names. A row's slack s [m/s] costs ``slack_cost * s +
+    slack_weight * s^2``.
     """
 
     index: Integers
@@ -379,7 +381,7 @@ class Barrier(Columns):
 class BarrierTerm(ABC):
     """M named rows that bound the velocity.
 
-    A term without a distance defines `rows` alone: infinite distance exempts it from step checks.
+    A term without distances defines only `rows`: infinite distances exempt it from a step's check.
     """
 
     kind = RowKind.LIMIT

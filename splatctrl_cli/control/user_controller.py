@@ -23,7 +23,7 @@ class ControllerStart:
     """A controller's initial input.
 
     joints (J,): names, in the order of all vectors; lower, upper, home (J,) [rad]; velocity_limit (J,) [rad/s];
-    acceleration_limit (J,) [rad/s^2] (None: no limit); frame to drive; period [s] of a velocity; margin [m] to the
+    acceleration_limit (J,) [rad/s^2] (None: no limit); frame: to drive; period [s] of a velocity; margin [m] to the
     scene.
     """
 
@@ -39,7 +39,6 @@ class ControllerStart:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "ControllerStart":
-        """Parse the first line."""
         arrays = ("lower", "upper", "velocity_limit", "acceleration_limit", "home")
         return cls(
             joints=tuple(document["joints"]),
@@ -52,7 +51,7 @@ class ControllerStart:
 
 @dataclass(frozen=True, kw_only=True)
 class ClearanceRow:
-    """A row that a velocity v (J,) [rad/s] keeps if ``G @ v <= h``; G (J,) [m/rad], h [m/s].
+    """A row, satisfied by velocities v (J,) [rad/s] with ``G @ v <= h``; G (J,) [m/rad], h [m/s].
 
     name: moving sphere (kind "scene") or pair of spheres (kind "self"); distance, margin [m].
     """
@@ -69,10 +68,10 @@ class ClearanceRow:
 class ControllerInput:
     """A controller's input at a step, in world.
 
-    q (J,) [rad]; dq (J,) [rad/s]; goal, pose (4, 4) of goal and frame; error (6,) [m, rad]: twist from frame to goal
-    in a second, linear first; jacobian (6, J) of the frame. goal_twist (6,) [m/s, rad/s], goal_posture (J,) [rad] and
-    its goal_velocity (J,) [rad/s] are None for a pose alone. rows() returns our controller's rows: moving spheres,
-    and pairs that an allowed velocity could violate.
+    q (J,) [rad]; dq (J,) [rad/s]: last velocity; goal, pose (4, 4): of goal and frame; error (6,) [m, rad]:
+    twist from frame to goal in a second, linear first; jacobian (6, J) of the frame. goal_twist (6,) [m/s, rad/s],
+    goal_posture (J,) [rad] and its goal_velocity (J,) [rad/s] are None if the goal is only a pose. rows() returns the
+    built-in controller's: moving spheres, and pairs that an allowed velocity could violate.
     """
 
     stamp_ns: int
@@ -134,7 +133,7 @@ def serve(target: str) -> None:
 
 
 def class_named(target: str) -> Callable[[ControllerStart], Controller]:
-    """Class ``module:Class``, from the current folder too. Exits with a sentence if missing."""
+    """Class ``module:Class``, also from the current folder. Exits with a message if missing."""
     module_name, _, name = target.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:

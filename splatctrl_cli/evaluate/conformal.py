@@ -1,9 +1,9 @@
-"""A bound on a map's missed surface from held-out depth: split conformal prediction over time.
+"""A bound on a map's error from held-out depth: split conformal prediction over time.
 
-Each held-out frame set has one number, its largest miss. Dependent sets form stretches of the misses' autocorrelation
-time, that long apart; a stretch's score is its largest miss. If n scores and a new one are exchangeable, the k-th
-smallest bounds the new one with probability at least `confidence`, for ``k = ceil((n + 1) * confidence)`` (Vovk,
-Gammerman and Shafer 2005; Lei et al. 2018, section 2).
+A frame set's miss is its largest distance from held-out points to the map. Frame sets form stretches, as long as the
+misses' autocorrelation time and as far apart; a stretch's score is its largest miss. If n scores and a new one are
+exchangeable, the k-th smallest bounds the new one with probability at least `confidence`. There,
+``k = ceil((n + 1) * confidence)`` (Vovk, Gammerman and Shafer 2005; Lei et al. 2018, section 2).
 
 The bound is for a further stretch, not each state, and not for surface without depth, or another scene or camera.
 """
@@ -16,14 +16,14 @@ import numpy as np
 from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.records import Float64, Index
 
-ROUNDING = 1e-9  # of (n + 1) * confidence, which is a whole number where it should be
+ROUNDING = 1e-9  # error of (n + 1) * confidence where that is a whole number
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConformalBound:
     """A score [m] that a further stretch does not exceed with `confidence`.
 
-    From num_stretches of `length` sets; at: index of the deciding set.
+    num_stretches: of `length` frame sets; at: index of the frame set with this score.
     """
 
     bound: float
@@ -34,9 +34,9 @@ class ConformalBound:
 
 
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
-    """The bound of misses (T,) [m], one per frame set by time, NaN for none.
+    """The bound from misses (T,) [m] of frame sets by time, NaN for none.
 
-    None below FEWEST_STRETCHES stretches. `confidence` is lowered to what their number allows.
+    None below FEWEST_STRETCHES stretches. n stretches allow a `confidence` up to n / (n + 1).
     """
     if not np.isfinite(misses).any():
         return None
@@ -58,7 +58,7 @@ def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None
 def conformal_rank(num_scores: int, confidence: float) -> int:
     """Rank of the bounding score, from 1: ``ceil((n + 1) * confidence)``.
 
-    n + 1 if none bounds.
+    n + 1 if no score bounds.
     """
     return math.ceil((num_scores + 1) * confidence - ROUNDING)
 
@@ -66,8 +66,8 @@ def conformal_rank(num_scores: int, confidence: float) -> int:
 def autocorrelation_time(misses: Float64) -> int:
     """Number of frame sets, at least 1, over which misses (T,) correlate.
 
-    ``1 + 2 sum_k rho_k``, rounded up, to the first lag k with autocorrelation rho <= 0 (Geyer 1992, by single lags).
-    NaN is left out; constant misses give 1.
+    ``1 + 2 sum_k rho_k``, rounded up; the sum ends before the first lag k with autocorrelation rho_k <= 0 (Geyer
+    1992, by single lags). NaN is left out; constant misses give 1.
     """
     is_there = np.isfinite(misses)
     apart = np.where(is_there, misses, 0.0) - is_there * (np.mean(misses[is_there]) if is_there.any() else 0.0)
@@ -78,7 +78,7 @@ def autocorrelation_time(misses: Float64) -> int:
     for lag in range(1, len(misses)):
         num = int(np.count_nonzero(is_there[lag:] & is_there[:-lag]))
         covariance = 0.0 if num == 0 else float(apart[lag:] @ apart[:-lag]) / num
-        rho = (1 - lag / len(misses)) * covariance / variance  # the biased estimate, where nothing is missing
+        rho = (1 - lag / len(misses)) * covariance / variance  # the biased estimate, if no value is missing
         if rho <= 0:
             break
         total += 2 * rho
@@ -86,9 +86,9 @@ def autocorrelation_time(misses: Float64) -> int:
 
 
 def stretches(num_sets: int, length: int) -> Index:
-    """The stretch (T,) of each set; `length` sets lie between two stretches.
+    """Stretch (T,) of each frame set; stretches are `length` sets long and `length` apart.
 
-    Sets between count to the previous stretch, which only raises its score.
+    Sets between two stretches count to the earlier one, which can only raise its score.
     """
     period = 2 * length - 1
     whole = max((num_sets + period - length) // period, 1)
@@ -96,7 +96,7 @@ def stretches(num_sets: int, length: int) -> Index:
 
 
 def stretch_scores(misses: Float64, stretch: Index) -> tuple[Float64, Index]:
-    """Each stretch's largest miss (n,), and its set (n,)."""
+    """Largest miss (n,) of each stretch, and index (n,) of its frame set."""
     known = np.flatnonzero(np.isfinite(misses))
     order = known[np.lexsort((-misses[known], stretch[known]))]
     first = order[np.unique(stretch[order], return_index=True)[1]]

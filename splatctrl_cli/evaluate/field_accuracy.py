@@ -20,7 +20,7 @@ from splatctrl_cli.robot.link_meshes import MeshDistance
 
 @dataclass(frozen=True, kw_only=True)
 class BandAccuracy:
-    """Errors field - truth [m] in a distance band; positive is unsafe. None if empty."""
+    """Errors, field less truth [m], in a distance band; positive is unsafe. None if empty."""
 
     lower: float
     upper: float
@@ -52,7 +52,7 @@ OVER_SCALES = {
 
 
 def figures_of(document: Mapping[str, Any]) -> dict[str, float | None]:
-    """The numbers of an accuracy, as in ``field.json``, by the names of `metric_scales`."""
+    """Numbers of a ``field.json`` document, by the names of `metric_scales`."""
     figures = {
         f"{where}.{name}.{band_name(band['lower'], band['upper'])}.{figure}": value
         for where in ("everywhere", "seen")
@@ -82,12 +82,12 @@ def field_accuracy(
 ) -> dict[str, Any]:
     """Compare fields with the truth at points outside the objects, as in ``field.json``.
 
-    Everywhere and where seen: each field's bands. over_estimate: share of cells above the truth by more than
-    `allowance` [m], and their excess; holds: there are cells, and none is. Without known visibility nothing is seen.
+    everywhere, seen: each field's bands, at all and at seen points; seen is empty if unknown. over_estimate: share of
+    seen points (all, if unknown) up to 20 cm where `hard` exceeds the truth by more than `allowance`, and the excess.
+    allowance [m]: 1 cm + `median_radius`. holds: there are such points, and no excess.
 
     distances: name -> (Q,) [m], including `hard`. truth (Q,) [m]: >= 0 counts. seen (Q,): a training camera saw the
-    nearest true surface point; None if unknown. The over-estimate is of `hard` at seen points up to 20 cm, against 1
-    cm + `median_radius` [m]. Raises InputError for unequal lengths, or without `hard`.
+    nearest true surface point; None if unknown. Raises InputError for unequal lengths, or without `hard`.
     """
     refuse_if("hard" not in distances, f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
     for name, values in {**distances, **({} if seen is None else {"seen": seen})}.items():
@@ -121,8 +121,8 @@ def distance_at(distance: GridDistance, cells: NDArray[np.int64]) -> Float64:
 def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
     """A grid's distances by field name: sdf, hard, se, gpdf.
 
-    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre. Raises InputError with
-    neither.
+    Without its channel, hard is ``bound`` plus the header's margin, within a micrometre. Raises InputError without
+    hard and bound.
     """
     distances: dict[str, GridDistance] = {
         name: (grid.channels[name], 0.0) for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels
@@ -197,12 +197,14 @@ def compare_with_truth(
 ) -> tuple[dict[str, Any], dict[str, Reliability]]:
     """Accuracy of `FIELDS` where `frames` saw the surface (``field.json``), and reliability by probability form.
 
-    Of sampled cells, world: centres, nearest surface points (Q, 3), `FIELDS`, true distance (Q,) [m]. name: of the
-    truth. workspace: where the scene keeps splats. probabilities: functions of points (Q, 3) and sdf (Q,) [m].
-    num_blank cells have no distance; num_near of the rest lie outside objects within 20 cm. A training camera saw the
-    nearest surface point of num_seen, and of num_outside_workspace where the scene keeps no splats. reliability: at
-    seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR`,
-    or None. Raises NotEvaluableError with no cell near an object.
+    Of sampled cells, world [m]: points (Q, 3), their centres; surface (Q, 3), nearest true surface points; fields,
+    `FIELDS` (Q,); distance (Q,), the truth. name: of the truth. workspace: where the scene has splats. probabilities:
+    functions of points (Q, 3) and sdf (Q,) [m].
+
+    num_blank cells have no distance; num_near others lie outside objects, within 20 cm. A training camera saw the
+    nearest surface point of num_seen of these in the workspace, and of num_outside_workspace outside it. reliability:
+    at seen cells within 20 cm of a surface. error_mean, error_sigma [m]: of sdf at seen cells within
+    `PROBABILITY_NEAR`, or None. Raises NotEvaluableError with no cell near an object.
     """
     sdf = fields["sdf"]
     is_blank = ~np.isfinite(sdf)
@@ -253,9 +255,9 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     """Errors of cells sampled by `seed`, against the exact mesh distance, as in ``field.json``.
 
     The mesh is in the grid's frame [m]. num_in_reach cells lie in its box widened by 20 cm; num_drawn were sampled.
-    Of these num_unknown have no distance, num_inside lie inside the mesh, and the num_near compared lie outside
-    within 20 cm. Inside a closed mesh nothing is compared: the field is a shell. An open mesh's distance is unsigned.
-    Raises InputError for another file, NotEvaluableError with no cell near it.
+    Of these, num_unknown have no distance, num_inside lie inside the mesh, and num_near outside within 20 cm. Only
+    num_near are compared: inside a closed mesh, the field is a shell. An open mesh's distance is unsigned. Raises
+    InputError for a file that is no mesh, NotEvaluableError with no cell near it.
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
@@ -296,7 +298,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
 
 
 def _draw_cells(grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int) -> tuple[Index, int]:
-    """Sampled cells (C, 3) in a box, in order, and their number there."""
+    """Sampled cells (C, 3) in a box, in order, and the number of all its cells."""
     shape = np.array(grid.channels["sdf"].shape)
     first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
     last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)

@@ -1,8 +1,8 @@
 """A baked field against held-out depth, and a scene's surface against reference points.
 
 A depth pixel at point p bounds the distance at x by ``|x - p|``, and the ray up to p is free. A field above the
-distance to the nearest measured point over-estimates. A lower one errs only if the ball up to that point was seen
-free: else it may know other surface.
+distance to the nearest measured point over-estimates. A lower field errs only if the ball up to that point was seen
+free; else it may know another surface.
 """
 
 import math
@@ -43,11 +43,11 @@ def cloud_score(
 ) -> dict[str, float]:
     """Distances [m] between points (P, 3) of a surface and a reference (R, 3), world.
 
-    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; others count
-    only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference. completeness:
-    the reference to the surface. chamfer: the mean of both. completeness_seen: of reference points seen (R,) by a
-    training camera. nan without points. unit: metres per unit of the reference's file. Raises NotEvaluableError
-    without near points, or if another unit fits.
+    As in DTU's evaluation and jzhangbs/DTUeval-python, eval.py: means of distances below `max_distance`; larger
+    distances count only in the `*_beyond` shares. accuracy: surface points, of counts (P,) or all, to the reference.
+    completeness: the reference to the surface. chamfer: the mean of accuracy and completeness. completeness_seen: of
+    reference points seen (R,) by a training camera. nan without points. unit: metres per unit of the reference's
+    file. Raises NotEvaluableError without near points, or if another unit fits better.
     """
     refuse_if(
         not max_distance > 0, f"--cloud-max: expected a distance above 0 m, got {max_distance:g}", error=UsageError
@@ -78,7 +78,7 @@ def cloud_score(
 
 def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
     some, others = (p[:: max(1, len(p) // 20_000)] for p in (points, reference))
-    factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
+    factors = (1.0, 1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, mistaken for each other
     fits = {factor: _overlap(some, factor * others, margin) for factor in factors}
     best = max(fits, key=lambda factor: fits[factor])
     refuse_if(
@@ -91,7 +91,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
 
 
 def _overlap(points: Float64, others: Float64, margin: float) -> float:
-    """Intersection over union of boxes without their ends of 1 %, widened by `margin` [m]."""
+    """Intersection over union of boxes from percentile 1 to 99, widened by `margin` [m]."""
     (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
     sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
     shared = float(np.prod(np.maximum(sides, 0.0)))
@@ -110,10 +110,10 @@ CLOUD_SCALES = {  # by the names of `cloud_score`
 
 
 def space_out(points: Float64, spacing: float) -> Float64:
-    """Points (P, 3), visited in random order, farther than `spacing` [m] from all kept before.
+    """Points (P, 3), visited in random order, farther than `spacing` [m] from all chosen before.
 
-    As DTU thins (DTUeval-python, eval.py), so that every layer of a scattered surface counts. Points in cubes of half
-    the edge are merged first (of the whole edge, if over 6 million are left).
+    As in DTU's thinning (DTUeval-python, eval.py), every layer of a scattered surface counts. First, `thin` leaves a
+    point per cube of edge `spacing` / 2, or `spacing` if over 6 million are left.
     """
     _check_spacing(spacing)
     some = thin(points, spacing / 2)
@@ -124,7 +124,7 @@ def space_out(points: Float64, spacing: float) -> Float64:
         cKDTree(some).query_pairs(spacing, output_type="ndarray") if len(some) else np.empty((0, 2), np.int64)
     ).T
     is_open, chosen = np.ones(len(some), np.bool_), np.zeros(len(some), np.bool_)
-    while is_open.any():  # points without an earlier open neighbour stay, their neighbours go: as if in turn
+    while is_open.any():  # points without an earlier open neighbour stay, and their neighbours go, as one by one
         first = is_open.copy()
         first[high] = False
         chosen |= first
@@ -138,7 +138,7 @@ def space_out(points: Float64, spacing: float) -> Float64:
 def thin(points: Float64, spacing: float) -> Float64:
     """The first of points (P, 3) per cube of edge `spacing` [m].
 
-    Thinning parts beforehand changes nothing.
+    Thinning some points beforehand changes nothing.
     """
     _check_spacing(spacing)
     if not len(points):
@@ -155,7 +155,7 @@ def _check_spacing(spacing: float) -> None:
 
 
 def points_on(mesh: TriangleMesh, spacing: float) -> Float64:
-    """Random points (P, 3) [m] by area, four per squared `spacing`, at most 2 million."""
+    """Random points (P, 3) [m] on a mesh, four per squared `spacing`, at most 2 million."""
     num = min(math.ceil(4 * 0.5 * np.linalg.norm(face_normals(mesh.corners), axis=1).sum() / spacing**2), 2_000_000)
     return draw_on(mesh, num, np.random.default_rng(0))[0]
 
@@ -189,7 +189,7 @@ def _box(points: Float64) -> str:
     return f"{corner(points.min(axis=0))} to {corner(points.max(axis=0))}"
 
 
-REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ray
+REACH = fixed.BANDS[-1][1]  # [m] before the surface, within which points are drawn on a ray
 
 
 def compare_with_held_out_depth(
@@ -202,9 +202,10 @@ def compare_with_held_out_depth(
 ) -> dict[str, Any]:
     """Errors [m] of interpolated distances on held-out rays sampled by `seed`, as in ``field.json``.
 
-    on_surface: at measured points, whose distance is 0. before: on the rays in front; `seen` points have a ball, up
-    to the nearest measured point, seen free, so under-estimates count too. over_estimate: over all points. num_edges
-    pixels lie at depth edges, num_outside points outside the grid, num_unknown at a corner without distance.
+    on_surface: at measured points, whose distance is 0. before: on the rays in front; there, a point is `seen` if the
+    ball up to its nearest measured point was seen free, so that under-estimates count, too. over_estimate: over all
+    points. num_edges pixels lie at depth edges, num_outside points outside the grid, num_unknown at a corner without
+    distance.
 
     frames: of held-out cameras, in the grid's frame. counted: per frame (H, W), False on objects that the field
     leaves out; None: all count. Raises InputError for masks that do not fit, NotEvaluableError without a measured
@@ -248,7 +249,7 @@ def compare_with_held_out_depth(
 
 
 def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float64, Float64] | None) -> Bool:
-    """(H, W) False on points outside the scene's box, or near a robot sphere.
+    """Mask (H, W), False on points outside the scene's box, or near a robot sphere.
 
     spheres: centres (S, 3) and radii (S,) [m], world.
     """
@@ -263,7 +264,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
 
 
 def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:
-    """Surface points (M, 3) in a box, their eyes, and the edges left out."""
+    """Measured points (M, 3) in a box, their camera centres, and number of omitted edge pixels."""
     if counted is not None and [mask.shape for mask in counted] != [frame.depth.shape for frame in frames]:
         raise InputError(
             f"counted: expected a mask of the size of each of {len(frames)} frames, got {len(counted)} masks"
@@ -284,7 +285,7 @@ def _measure(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: B
 
 
 def depth_edges(depth: NDArray[np.float32]) -> Bool:
-    """(H, W) True where a neighbour's depth differs by more than a share."""
+    """True (H, W) where a neighbour's depth differs by more than HELD_OUT_EDGE, a share."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2

@@ -14,8 +14,6 @@ from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame, Stamps
 
 
 class Better(StrEnum):
-    """The direction in which a figure improves."""
-
     HIGHER = "higher"
     LOWER = "lower"
     NEITHER = "neither"
@@ -43,10 +41,10 @@ DESCRIBES = Scale()
 """A figure that is neither good nor bad."""
 GAP = Scale(unit="m", better=Better.HIGHER, absolute=1e-3)  # as far as a map that is being fitted moves in a frame
 ERROR = Scale(unit="m", better=Better.LOWER, absolute=1e-3, relative=0.02)
-FAULTS = Scale(better=Better.LOWER, relative=0.05)  # of 0 none may come, of 100 some may cross the line
+FAULTS = Scale(better=Better.LOWER, relative=0.05)  # 0 must stay 0; of 100, some may cross a limit
 BAD_SHARE = Scale(better=Better.LOWER, absolute=0.005, relative=0.02)
 GOOD_SHARE = Scale(better=Better.HIGHER, absolute=0.005)
-DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # as far as four seeds are apart
+DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.2)  # spread of four seeds
 SIMILARITY = Scale(better=Better.HIGHER, absolute=0.005)
 AGE = Scale(unit="s", better=Better.LOWER, absolute=0.01, relative=0.02)
 LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
@@ -56,7 +54,7 @@ LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
 class Fold:
     """A rule that makes one value of a column (T,).
 
-    pick: the value that contributes most. accumulate: values up to each state, beginning with `start`.
+    pick: the value that contributes most, "largest" or "least". accumulate: values up to each state, from `start`.
     """
 
     of: Callable[[Float64], float | None]
@@ -82,7 +80,7 @@ def lowest(values: Float64) -> float | None:
 
 
 def largest(values: Float64) -> float | None:
-    """The largest value; None if one is infinite, or without any."""
+    """The largest value; None if a value is infinite, or all are NaN."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 
@@ -102,7 +100,7 @@ TOTAL = Fold(of=lambda values: int(np.nansum(values)))
 NUMBER = Fold(of=TOTAL.of, pick="least", start=0.0, accumulate=lambda values: np.asarray(np.nancumsum(values)))
 
 
-FEWEST = 8  # recordings; of fewer there are too few different resamples for their percentiles to mean anything
+FEWEST = 8  # recordings; fewer have too few different resamples for meaningful percentiles
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 SEED = 0
@@ -121,7 +119,7 @@ class MeanChange:
 def mean_change(differences: Sequence[float]) -> MeanChange | None:
     """The mean of paired differences with its percentile interval; None below FEWEST pairs.
 
-    RESAMPLES draws with replacement, by SEED (Efron and Tibshirani 1993, section 13.3).
+    The interval is of RESAMPLES draws with replacement, by SEED (Efron and Tibshirani 1993, section 13.3).
     """
     values, num = np.asarray(differences, dtype=np.float64), len(differences)
     if num < FEWEST:
@@ -139,8 +137,8 @@ def clearance_agreement(
 ) -> dict[str, float | None]:
     """Agreement of clearance with truth (T,) [m], within 10 cm of seen surface.
 
-    By `FIGURES`: states compared; |clearance - truth| as median, 95 % and largest; largest over-estimate; share
-    within tolerance. None without states.
+    By `FIGURES`: number of states; median, 95 % quantile and largest of |clearance - truth|; largest over-estimate;
+    tolerance, and share within it. Errors are None without states.
     """
     tolerance = MAP_ALLOWANCE + median_radius
     compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
@@ -158,9 +156,9 @@ def clearance_agreement(
 def mark_seen(
     seen: Bool, points_world: FloatRows, stamp_ns: Stamps, frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
-    """Set `seen` (T,) where `frame`, not later than the stamp, saw the point [m].
+    """Set `seen` (T,) for points [m] that `frame` saw by the point's stamp.
 
-    points_world (T, 3) are read in blocks, only those not yet seen.
+    points_world (T, 3) not yet seen are read in blocks.
     """
     for first in range(0, len(seen), BLOCK):
         part = slice(first, first + BLOCK)

@@ -2,9 +2,9 @@
 
 Views are numbered from 0: view 0 is ``rect_001`` of DTU.
 
-ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, say where points count: ObsMask (X, Y, Z) has
-the cells of BB (2, 3), Res wide, that the reference scanner observed. Reference points count above the ground, at ``P
-(4) . (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
+ObsMaskN_10.mat and PlaneN.mat of DTU's ObsMask folder, in millimetres, define where points count. ObsMask (X, Y, Z)
+marks cells, Res wide, of the box BB (2, 3) that the reference scanner observed. Reference points count above the
+ground, at ``P (4) . (x, y, z, 1) > 0`` (DTU's PointCompareMain.m; jzhangbs/DTUeval-python, eval.py).
 """
 
 import re
@@ -42,10 +42,10 @@ class Split:
 class ScoreProtocol:
     """A named scoring protocol.
 
-    mask: pixels of the published figure: of a mask if given, of the object, or with reference depth. fill: outside
-    the mask in the published SSIM; is_zero_padded: without a mask, it has zeros beyond the border. size (width,
-    height) [px], scans: as published. Without scored views, every `every`-th view from `first` on is scored, with 0
-    all views, which also train. Without training views, those not scored train.
+    mask: pixels of the published figure: of a given mask, of the object, or with reference depth. fill: grey outside
+    the mask in the published SSIM; is_zero_padded: without a mask, that SSIM has zeros beyond the border. size
+    (width, height) [px], scans: as published. Without `scored`, every `every`-th view from `first` on is scored; with
+    `every` 0, all views are scored and train. Without `training`, views that are not scored train.
     """
 
     name: str
@@ -139,7 +139,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in _FIXED}
 
 
 def score_protocol(name: str) -> ScoreProtocol:
-    """The protocol of a name or ``holdout:`` rule. Raises UsageError, with the choices, for another."""
+    """The protocol of a name or ``holdout:`` rule. Raises UsageError, with the choices, for others."""
     if name.startswith("holdout:"):
         return _holdout(name)
     if name in PROTOCOLS:

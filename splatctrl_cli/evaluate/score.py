@@ -1,7 +1,7 @@
-"""Scores of rendered against recorded views, and what follows from them.
+"""Scores of rendered against recorded views, their changes and verdict.
 
-A score covers all pixels and, apart, those seen in training. A report is ``score.json``: ``metrics`` by
-flat name, ``protocol``, ``warnings``, ``views`` or ``results`` by scan.
+A score covers all pixels and, separately, pixels seen in training. A report is ``score.json``: ``metrics`` by flat
+name, ``protocol``, ``warnings``, and ``views`` or, by scan, ``results``.
 """
 
 import json
@@ -70,7 +70,7 @@ REGION = {
     "in_front": BAD_SHARE,
 }  # of the pixels of a region
 REGIONS = ("seen", "all", "masked")
-CORRECTED = "_corrected"  # of a figure of a view whose pose, exposure or depth was
+CORRECTED = "_corrected"  # ends the name of a view's figure with corrected pose, exposure or depth
 CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
 
 
@@ -88,7 +88,7 @@ def score_view(
 
     Returns figures by flat name (``psnr_seen`` [dB], ``depth_median_all`` [m]), nan for an empty region. color (H, W,
     3) in [0, 1]; depth (H, W) [m], normalised by accumulated opacity, 0 = none. seen, mask (H, W): pixels seen in
-    training, and of the mask rule. The published SSIM has grey `fill` outside the mask; without a mask, it exists
+    training, pixels of the mask rule. The published SSIM has grey `fill` outside the mask; without a mask, it exists
     only if is_zero_padded. Invalid pixels of `frame` are in no region.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
@@ -134,16 +134,16 @@ def free_mass(splats: SplatSet, grid: OccupancyGrid, free_below: float) -> float
 
 
 def share_in_front(depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool) -> float:
-    """Share of masked pixels with both depths whose `depth` is nearer by more than IN_FRONT.
+    """Share of masked pixels whose `depth` is nearer than `reference` by more than IN_FRONT.
 
-    nan without such pixels.
+    Only pixels with both depths count; nan without any.
     """
     both = mask & (depth > 0) & (reference > 0)
     return float(np.mean(depth[both] < reference[both] - IN_FRONT)) if both.any() else math.nan
 
 
 def metric_scales() -> dict[str, Scale]:
-    """Scales of all names of `total_score`, for comparing runs; a mask's occur only with one."""
+    """Scales of all figures of `total_score`, for comparing runs; some exist only with a mask."""
     of_regions = {f"{name}_{region}": scale for region in REGIONS for name, scale in REGION.items()}
     return {
         **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),
@@ -197,7 +197,7 @@ def read_baseline(path: Path) -> dict[str, Any]:
 
 
 def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
-    """New minus old figures, None if either is. Raises InputError if not comparable."""
+    """New minus old figures, None if either is missing. Raises InputError if not comparable."""
     earlier = read_baseline(path)
     now, then = ({**one["protocol"], "scans": one.get("scans")} for one in (report, earlier))
     for name in ("name", "split", "mask_rule", "resolution", "averaging", "scans"):
@@ -214,7 +214,7 @@ def changes(report: Mapping[str, Any], path: Path) -> dict[str, float | None]:
 
 
 def report_of_scans(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the scans; None for a figure missing in one."""
+    """Report of several scans: means, sums of `SUMS`, None for figures missing in one."""
     each, scans = list(results.values()), list(results)
     metrics = {
         name: (sum_of if name in SUMS else mean_of)([one["metrics"].get(name) for one in each])
@@ -380,7 +380,7 @@ def _thumbnail(image: NDArray[np.floating]) -> Float64:
 
 
 def _strangers(thumbnails: Sequence[tuple[str, Float64, Float64]]) -> list[str]:
-    """Views whose photo is clearly nearer another's render."""
+    """Views whose photo is clearly nearer another view's render."""
     if len(thumbnails) < 2:
         return []
     names, photos, renders = zip(*thumbnails, strict=True)

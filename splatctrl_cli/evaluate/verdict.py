@@ -30,11 +30,12 @@ _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a defi
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """One criterion's finding; `Criterion.reasons` names its `criterion`.
+    """One criterion's finding; `Criterion.reasons` fills in `criterion`.
 
     value, threshold: in `unit`, or None. time_s [s]: as in the output's files. place (3,) [m]: world. who: link,
-    sphere, joint or camera. cause: what is there. count: states, views or points behind the value. label: the
-    outcome's name if this decides, such as "contact". is_note: worth a line, decides nothing.
+    sphere, joint or camera. cause: appended to the sentence. count: states, views or points behind the value. label:
+    the outcome's name if this reason decides, such as "contact". is_note: only printed, without effect on the
+    verdict.
     """
 
     criterion: str = ""
@@ -61,13 +62,13 @@ class Reason:
 
 failed = partial(Reason, outcome=Outcome.FAILED)
 not_evaluable = partial(Reason, outcome=Outcome.NOT_EVALUABLE)
-"""The evidence does not reach."""
+"""A reason whose evidence does not suffice."""
 note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
-"""Decides nothing and is worth a line."""
+"""A reason that is printed, but does not affect the verdict."""
 
 
 def passed_reason(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
-    """A passed criterion, not worth a line."""
+    """A passed criterion, not printed."""
     return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
 
 
@@ -75,8 +76,8 @@ def passed_reason(sentence: str, value: float, threshold: float, unit: str, coun
 class Criterion(Generic[E]):
     """One criterion of a verdict.
 
-    find: its reasons, if it applies. meaning: the documentation's words, by default the first paragraph of its
-    docstring. broken: those on a violation.
+    find: its reasons, if it applies. meaning: its description in the docs, by default the first paragraph of find's
+    docstring. broken: description of a violation.
     """
 
     name: str
@@ -99,8 +100,8 @@ class Criterion(Generic[E]):
 class Verdict:
     """The outcome of a command and its reasons, deciding ones first.
 
-    label: the outcome in the command's word, such as "safe"; how: such as "proven"; scope: what was judged; notes:
-    decide nothing. is_damaged: part of the input was lost. counts: states, views or points by metric.
+    label: the command's word for the outcome, such as "safe"; how: such as "proven"; scope: what was judged; notes:
+    do not affect the outcome. is_damaged: part of the input was lost. counts: states, views or points by metric.
     """
 
     command: str
@@ -122,7 +123,7 @@ class Verdict:
         return EXIT_CODES[self.outcome] or (DAMAGED if self.is_damaged else 0)
 
     def exit_code_of(self, criteria: tuple[str, ...] | None) -> int:
-        """`exit_code` by criteria that begin with one of `criteria` (None: all)."""
+        """`exit_code` by criteria whose names begin with one of `criteria` (None: all)."""
         if criteria is None:
             return self.exit_code
         outcomes = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
@@ -130,7 +131,7 @@ class Verdict:
 
     @property
     def decisive(self) -> tuple[Reason, ...]:
-        """The reasons not passed, the outcome's first."""
+        """Reasons that did not pass, the outcome's first."""
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
 
     @property
@@ -177,7 +178,7 @@ def verdict_of(
 ) -> Verdict:
     """The verdict: failed if any reason failed, else not evaluable if any is, else passed.
 
-    Without any reason it is not evaluable. passed: the label when passed; a failure takes the first `Reason.label`.
+    Without any reason it is not evaluable. passed: the label when passed; a failure's is the first `Reason.label`.
     """
     all_reasons = list(reasons) or [not_evaluable(criterion="evidence", sentence="nothing was judged")]
     ordered = sorted(all_reasons, key=lambda reason: _WORST_FIRST.index(reason.outcome))
@@ -200,8 +201,8 @@ def verdict_of(
 class Result:
     """The result of a command; its repr is a few lines.
 
-    out: the file or folder that it wrote. metrics: figures by name. document: of ``--json``, empty for `out` and the
-    metrics. notes: worth a line. seconds: by stage.
+    out: the written file or folder. metrics: figures by name. document: printed by ``--json``; if empty, `out` and
+    the metrics are. notes: to print. seconds: by stage.
     """
 
     out: Path | None = None
@@ -227,7 +228,7 @@ class JudgedResult(Result):
 
 
 def read_verdict(document: Mapping[str, Any]) -> Verdict:
-    """A replay's verdict, of what `Verdict.as_dict` returned."""
+    """A replay's verdict, from the values of `Verdict.as_dict`."""
     rows = [
         row | {"outcome": Outcome(row["outcome"]), "place": row["place"] and tuple(row["place"])}
         for row in document["reasons"]
@@ -276,7 +277,7 @@ def check_gate_names(
 ) -> None:
     """Raise UsageError for a metric not in `names`, before the work.
 
-    elsewhere: metrics of other options, by those options.
+    elsewhere: metrics that other options add, by those options.
     """
     for requirement in requirements:
         name, _, _ = parse_gate(requirement)

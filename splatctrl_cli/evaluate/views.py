@@ -21,8 +21,7 @@ from splatctrl_cli.records import Bool, Float32, Float64, Index, RecordSource, R
 class View:
     """A frame to score, its name, and the training frames known at its time.
 
-    The name is the camera and a number: within its frames with a clock, else among all views, or the views' own, the
-    stamp.
+    The name is the camera and a count of its views (without a clock, of all frames) or the stamp.
     """
 
     name: str
@@ -41,8 +40,8 @@ def views_to_score(
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
-    With a clock, each training camera's newest frame up to the view's stamp is known; without, every one. corrected:
-    a frame with training's pose, exposure and depth.
+    With a clock, each training camera's newest frame up to the view's stamp is known; without, all its frames.
+    corrected: gives a frame training's pose, exposure and depth.
     """
     if not has_clock:
         known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
@@ -72,9 +71,9 @@ def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
 
 
 def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """(Q,) True where a frame measured a surface at a point (Q, 3) [m].
+    """True (Q,) for points (Q, 3) [m] at which a frame measured a surface.
 
-    The nearest pixel's depth agrees within `tolerance` [m]: neither occluded nor in free space.
+    The nearest pixel's depth agrees within `tolerance` [m]: the point is neither occluded nor in free space.
     """
     seen = np.zeros(len(points_world), dtype=np.bool_)
     for frame in frames:
@@ -93,7 +92,7 @@ def surface_points(frame: RgbdFrame) -> tuple[Float64, Bool]:
 
 
 def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """(H, W) True where one of `others` measured the frame's surface, nearest cameras first."""
+    """True (H, W) where one of `others` measured the frame's surface."""
     points_world, seen = surface_points(frame)
     center = frame.T_world_camera[:3, 3]
     nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
@@ -102,7 +101,7 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
 
 
 def measured_along(points_world: NDArray[np.floating], frame: RgbdFrame) -> tuple[Index, Float64, Float32]:
-    """Indices (K,) of points (Q, 3) in the image; their and measured depth [m]."""
+    """Indices (K,) of points (Q, 3) in the image; their depth and the measured one (K,) [m]."""
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
     landing = np.flatnonzero(points_camera[:, 2] > 1e-6)
     pixels = np.floor(project(frame.intrinsics, points_camera[landing]) + 0.5)
@@ -133,7 +132,7 @@ def ssim_map(
     """Structural similarity (H, W, 3) of images in [0, 1] (Wang et al. 2004).
 
     Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments. The border is mirrored, with its
-    edge pixel repeated. Zero-padding (graphdeco-inria/gaussian-splatting, utils/loss_utils.py) hides errors there.
+    edge pixel repeated; zero-padding (graphdeco-inria/gaussian-splatting, utils/loss_utils.py) hides errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
@@ -150,8 +149,8 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
     """SSIM of images in [0, 1], `fill` outside the mask, as in NeRF's papers.
 
     scikit-image's default (skimage/metrics/_structural_similarity.py before 0.20): box window of 7 pixels, sample
-    moments, 3 border pixels left out. Its data range of 2 for floats lifts the figure: compare only within its kind.
-    nan below 7 pixels, or for an empty mask.
+    moments, 3 border pixels left out. Its data range of 2 for floats raises the figure: compare it only with such
+    figures. nan below 7 pixels, or for an empty mask.
     """
     if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan

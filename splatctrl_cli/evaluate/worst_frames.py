@@ -22,9 +22,9 @@ INK, PAPER = (34, 34, 34), (255, 255, 255)
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Spheres (S, 3), radii (S,) [m], world, and the worst of them, to draw.
+    """Spheres to draw, and the worst one: centers (S, 3), radii (S,) [m], world.
 
-    obstacle (3,): nearest surface point, or NaN. is_moving (S,): by a joint.
+    obstacle (3,): nearest surface point, or NaN. is_moving (S,): moved by a joint.
     """
 
     stamp_ns: int
@@ -43,7 +43,7 @@ Sight = tuple[Moment, RgbdFrame]
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first.
 
-    Each is the least within 0.5 s on either side. NaN does not count.
+    Each is the least within 0.5 s. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     padded = np.concatenate([[np.inf], values, [np.inf]])
@@ -62,9 +62,9 @@ def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int) -> 
 
 
 def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """Each moment's image that best shows its worst sphere, or None.
+    """Image that best shows each moment's worst sphere, or None.
 
-    One pass over frames, by stamp.
+    frames: by rising stamp, read once.
     """
     sights: list[Sight | None] = [None] * len(moments)
     waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
@@ -83,7 +83,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 
 def draw_sight(path: Path, moment: Moment, frame: RgbdFrame) -> None:
     """Write the image with the arm's silhouette, a line to the obstacle, and the caption."""
-    zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
+    zoom = max(1, -(-960 // frame.intrinsics.width))  # a picture is at least 960 px wide
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
     picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     T_camera_world = np.linalg.inv(frame.T_world_camera)
@@ -137,7 +137,7 @@ def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
 
 
 def _ring(center: Float64, radius: float, intrinsics: Intrinsics, zoom: int) -> list[Int32]:
-    """Outline (49, 2) [px / 2^SHIFT] of a sphere; empty if it is around or behind the camera."""
+    """Outline (49, 2) [px / 2^SHIFT] of a sphere; empty if not wholly before the camera."""
     away = float(np.linalg.norm(center))
     if center[2] - radius <= NEAR:
         return []

@@ -1,11 +1,11 @@
 """Coverage of a robot's collision surface by its spheres, with proven bounds.
 
-phi(p) = min_i |p - c_i| - r_i is the distance outside a union of balls. Each term is convex, so over a triangle it is
-largest at a corner:
+phi(p) = min_i |p - c_i| - r_i is the distance outside a union of balls. Each term is convex, and so largest at a
+triangle's corner:
 
 max over the triangle of phi <= min_i max_k |v_k - c_i| - r_i,
 
-exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest corner phi agree.
+exact if one ball is nearest throughout. Triangles are halved until this bound and the largest corner phi agree.
 Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
 """
 
@@ -31,7 +31,7 @@ PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 class Deficit:
     """Largest distance of a surface point outside all spheres: lower <= truth <= proven [m].
 
-    Negative: all of the surface is inside. place (3,): of `lower`.
+    Negative if all of the surface is inside. place (3,): where `lower` is found.
     """
 
     proven: float
@@ -41,11 +41,11 @@ class Deficit:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkCoverage:
-    """Coverage of one link's collision surface by its spheres and those fixed to it.
+    """Coverage of one link's collision surface by the spheres of its rigid body.
 
-    area [m2]; uncovered_area [m2], proven bounds; deficit: None without spheres; protrusion [m]: bound of spheres
-    beyond the body; worst_sphere: its index in the sphere set, -1 without spheres; is_closed: False if a hull
-    replaced an open surface.
+    area [m2]; uncovered_area [m2], with proven bounds; deficit: None without spheres; protrusion [m]: upper bound of
+    a sphere's reach outside the link; worst_sphere: that sphere's index, -1 without spheres; is_closed: False if a
+    hull replaced an open surface.
     """
 
     link: str
@@ -64,13 +64,12 @@ class LinkCoverage:
 
     @property
     def uncovered_share(self) -> float:
-        """Surface share outside all spheres."""
         return self.uncovered_area / self.area
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageReport:
-    """Coverage by link; stray_spheres: spheres on links without collision geometry, unmeasured."""
+    """Coverage by link; stray_spheres: number on bodies without collision geometry."""
 
     links: tuple[LinkCoverage, ...]
     num_spheres: int
@@ -101,7 +100,7 @@ class CoverageReport:
 
     @property
     def max_protrusion(self) -> float:
-        """Largest protrusion [m] of any sphere."""
+        """Largest protrusion [m]."""
         return max(link.protrusion for link in self.links)
 
 
@@ -110,7 +109,7 @@ def coverage_of_solids(
 ) -> CoverageReport:
     """Measure how spheres cover the `solids` of each link of `urdf`.
 
-    Spheres of links joined by fixed joints count. Cached. Raises InputError for a sphere on an unknown link.
+    Spheres of a link's whole rigid body count. Cached. Raises InputError for a sphere on an unknown link.
     """
     bodies = urdf.rigid_bodies()
     unknown = [link for link in spheres.links if link not in bodies]
@@ -165,7 +164,7 @@ def largest_deficit(
 ) -> Deficit:
     """Largest phi on `triangles`, between bounds that agree to `tolerance` [m].
 
-    Triangles below `floor` are not refined.
+    Triangles with a bound below `floor` [m] are not refined.
     """
     best, place, proven = -np.inf, np.zeros(3), -np.inf
     pending = triangles
@@ -186,7 +185,7 @@ def uncovered_area(
 ) -> tuple[float, float, float]:
     """Area [m2] with phi > 0: best guess, proven lower and upper bound.
 
-    Triangles are halved until in one sphere, outside all, or `resolution` [m] long.
+    Triangles are halved until they are in one sphere, outside all, or at most `resolution` [m] long.
     """
     outside = unsure = guess = 0.0
     pending = triangles

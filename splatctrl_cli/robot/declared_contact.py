@@ -16,10 +16,10 @@ REMEDY = "see splatctrl help declare for the keys of a declaration"
 
 @dataclass(frozen=True, kw_only=True)
 class DeclaredContact:
-    """A carried box or an intended contact of `link`, `start` to `end` [s after the first state].
+    """A carried box or intended contact of `link`, from `start` to `end` [s after the first state].
 
-    box [m]: carried, in the link's frame; or in world, around a contact, which has a `reason`. is_learned: from an
-    observed grasp, not a file.
+    box [m]: the carried one in the link's frame, or the contact's region in world. reason: of a contact. is_learned:
+    from an observed grasp, not a file.
     """
 
     link: str
@@ -85,7 +85,7 @@ class Declarations:
 
 
 def carried_words(entry: Mapping[str, Any]) -> str:
-    """An entry of `Declarations.carried_uses` in words; warn if unused."""
+    """An entry of `Declarations.carried_uses` in words, with a warning if unused."""
     used = (
         f"{entry['num_uses']} points"
         if entry["num_uses"]

@@ -43,8 +43,9 @@ class MeshDistance:
     def closest(self, points: Float64) -> tuple[Float64, Float64, Bool]:
         """Distance (Q,), nearest surface point (Q, 3) and is_inside (Q,).
 
-        Inside by the angle-weighted normal of the nearest face, edge or vertex, exact for a closed mesh; all False
-        for an open one (Baerentzen, Aanaes, Signed distance computation using the angle weighted pseudonormal, 2005).
+        The angle-weighted normal of the nearest face, edge or vertex decides is_inside, exactly for a closed mesh
+        (Baerentzen, Aanaes, Signed distance computation using the angle weighted pseudonormal, 2005). For an open
+        mesh it is False.
         """
         distance, face, shares = self._tree.closest(points)
         surface = np.einsum("qk,qka->qa", shares, self.mesh.corners[face])
@@ -72,7 +73,7 @@ class MeshDistance:
         return normal
 
 
-MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh: outside, it has another unit
+MESH_LENGTHS = (0.001, 10.0)  # [m] of a link's mesh; any other length means another unit
 LINK_LENGTHS = (0.01, 3.0)  # [m] of a link in the right unit
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 
@@ -81,8 +82,8 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0}
 class Solid:
     """A piece of a link's collision geometry, in the frame of `link` [m].
 
-    slack: largest distance of the true surface. body: closed mesh for inside tests, or the convex hull, None if flat.
-    ball: centre (3,), radius.
+    slack: largest distance of `surface` from the true one. body: closed mesh for inside tests, or an open surface's
+    convex hull, None if flat. ball: centre (3,), radius.
     """
 
     link: str
@@ -95,8 +96,8 @@ class Solid:
 def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
     """Read each link's solids, in the file's order.
 
-    folders: for ``package://``, before those above the URDF. Raises InputError for an unreadable mesh, other shapes,
-    or no collision geometry.
+    folders: for ``package://``, tried before those above the URDF. Raises InputError for an unreadable mesh, an
+    unknown shape, or no collision geometry.
     """
     if urdf.other_shapes:
         link, tag = urdf.other_shapes[0]
@@ -126,8 +127,8 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
 def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:
     """A mesh's file.
 
-    ``package://NAME/REST`` is NAME/REST, or REST in a folder NAME, in `folders` or above the URDF; a path without
-    scheme is relative to the URDF. Raises InputError if not found.
+    ``package://NAME/REST`` is NAME/REST, or REST in a folder NAME, among `folders` and folders above the URDF. A path
+    without scheme is relative to the URDF. Raises InputError if not found.
     """
     name = mesh.filename
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
@@ -153,9 +154,9 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
 
 
 class SolidDistance:
-    """A bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
+    """Upper bound on the signed distance (Q,) [m] of points (Q, 3), link frame, to solids.
 
-    Outside exact, inside no deeper than the truth; unsigned for an open, flat surface.
+    It is exact outside, inside no deeper than the truth, and unsigned for an open, flat surface.
     """
 
     def __init__(self, solids: Sequence[Solid]) -> None:
@@ -268,7 +269,7 @@ def _prism(radius: float, length: float) -> tuple[Float64, Index]:
 
 @cache
 def _unit_ball() -> tuple[Float64, Index, float]:
-    """A polyhedron inside the unit sphere, and its largest distance from it."""
+    """A polyhedron inside the unit sphere, and the sphere's largest distance from it."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     corners = axes[np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])]
     for _ in range(SPHERE_ROUNDS):

@@ -34,11 +34,11 @@ from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 class RobotModel:
     """Kinematics, limits and collision spheres of one arm; world frame, SI units, float64.
 
-    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without;
-    base_position (3,) [m]; sphere_set in link frames; frame_names: links that `frame_pose` knows; left_out:
-    sphere-file links missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None for the
-    reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; locked: fingers' fixed
-    values.
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); middle (J,): of the limits, 0 without limits;
+    base_position (3,) [m]; sphere_set: in link frames; frame_names: links that `frame_pose` knows; left_out:
+    sphere-file links missing from the URDF; bare_links: URDF links with a body but no sphere; coverage: None if
+    unknown, for the reason coverage_unknown; sphere_deficit (S,) [m]: `deficit_by_sphere`, NaN if unknown; locked:
+    values of locked fingers.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class RobotModel:
         )
 
     def carrying(self, boxes: Sequence[tuple[str, Box]]) -> "RobotModel":
-        """Robot with carried boxes in link frames, in spheres and surface."""
+        """Robot whose spheres and surface include carried boxes, in link frames."""
         robot = RobotModel(
             self.urdf,
             self._model,
@@ -183,7 +183,7 @@ class RobotModel:
         return robot
 
     def replace_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
-        """Robot with measured coverage; `unknown` explains a missing one."""
+        """Robot with measured coverage; `unknown` explains missing coverage."""
         deficit = (
             np.full(len(self.sphere_set.radii), np.nan)
             if coverage is None
@@ -199,7 +199,7 @@ class RobotModel:
         return self._surface
 
     def join_self_model(self, self_model: SelfModel) -> "RobotModel":
-        """Robot with a self-model's permanent parts; `surface_at` adds temporary ones."""
+        """Robot with a self-model's permanent parts; `surface_at` adds temporary parts."""
         return self._change(_surface=self.surface.joined(self_model.pieces()), self_model=self_model, _surfaces={})
 
     @property
@@ -217,7 +217,7 @@ class RobotModel:
         return self._surfaces[number]
 
     def at(self, stamp_ns: int) -> "RobotModel":
-        """Robot with its surface of a stamp [ns] for all times."""
+        """Robot whose surface is always that of a stamp [ns]."""
         return self._change(_surface=self.surface_at(stamp_ns), self_model=None) if self.changes else self
 
     def extents(self) -> dict[str, list[float]]:
@@ -234,7 +234,7 @@ class RobotModel:
 
     @property
     def self_allowance(self) -> Float64:
-        """Shortfall (P,) [m] of each pair from the configured margin (`robot.self_margins`)."""
+        """Reduction (P,) [m] of each pair's margin (`robot.self_margins`)."""
         return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _change(self, **attributes: object) -> "RobotModel":
@@ -244,7 +244,7 @@ class RobotModel:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings about these spheres, in sentences."""
+        """Warnings about these spheres."""
         name, bare, lost = self.urdf.path.name, ", ".join(self.bare_links), ", ".join(self.left_out)
         sentences = (
             (bare, f"{name}: no sphere covers {bare}; the clearance of these links is unknown"),
@@ -265,7 +265,6 @@ class RobotModel:
 
     @property
     def reach_box(self) -> Box:
-        """Box [m] around the base's reach."""
         reach = self.reach()
         return Box(lower=self.base_position - reach, upper=self.base_position + reach)
 
@@ -299,7 +298,7 @@ class RobotModel:
     ) -> dict[str, Float64]:
         """Signed gap (T,) [m] of each meshed link to the nearest ball.
 
-        Balls (N, 3), (N,) [m], world; positions (T, J).
+        Balls: centers (N, 3), radii (N,) [m], world. positions (T, J).
         """
         surface = self.surface
         return {
@@ -312,7 +311,7 @@ class RobotModel:
     def link_distances(self) -> dict[str, Callable[[Float64, Bool | None], Float64]]:
         """Signed distance functions of meshed links.
 
-        Each maps points (Q, 3), link frame, and a mask (Q,) of known outside points, or None, to distances (Q,) [m].
+        Each maps points (Q, 3), link frame, and a mask (Q,) of points surely outside, or None, to distances (Q,) [m].
         """
         links = {self.surface.links[number] for number in self.surface.trees}
         return {link: partial(self.surface.distance_to, link) for link in sorted(links)}
@@ -328,7 +327,7 @@ class RobotModel:
         )
 
     def lever_arms(self) -> Float64:
-        """Upper bounds (S, J) [m] on a centre's travel per radian (or metre), in any posture."""
+        """Upper bounds (S, J) [m] on a sphere centre's travel per radian (or metre), in any posture."""
         return lever_arms(self.chain, self.lower, self.upper)
 
     def reach(self) -> float:
@@ -362,7 +361,7 @@ class RobotModel:
     def joint_columns(self, log_joint_names: Sequence[str]) -> tuple[Index, Float64, Float64]:
         """Each joint's index, factor, offset (J,) in a log: ``position[order] * factor + offset``.
 
-        An unlogged joint follows the one that it mimics. Raises InputError for missing joints.
+        An unlogged joint follows the logged joint that it mimics. Raises InputError for missing joints.
         """
         log = {name: (column, 1.0, 0.0) for column, name in enumerate(log_joint_names)}
         for joint in self.urdf.joints:

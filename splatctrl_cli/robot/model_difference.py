@@ -13,8 +13,8 @@ _POSTURES = 3
 def model_difference(one: UrdfFile, other: UrdfFile) -> str:
     """The mechanical difference of `other` from `one`, in words; empty if none.
 
-    Compared: names and limits of movable joints, and places of common links at three postures, not shapes. Raises
-    ValueError for an unbuildable URDF.
+    Compared are names and limits of movable joints, and poses of common links at three postures, but no shapes.
+    Raises ValueError for an unbuildable URDF.
     """
     joints = [{joint.name for joint in file.joints if joint.kind in MOVABLE} for file in (one, other)]
     if joints[0] != joints[1]:

@@ -1,4 +1,4 @@
-"""Pairs of links to check for self-collision, and reasons to omit others (SRDF: MoveIt's)."""
+"""Pairs of links to check for self-collision, and reasons to omit pairs (MoveIt's SRDF)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -56,9 +56,10 @@ CHUNK = 200  # postures at a time
 
 @dataclass(frozen=True, kw_only=True)
 class LinkPair:
-    """Two links with spheres, and the gap between these over sampled postures.
+    """Two links with spheres, and their spheres' gap over sampled postures.
 
-    left_out: reason, None if kept. least_gap, largest_gap [m] (nan: not sampled); hit_share: of postures in contact.
+    left_out: reason to omit it, None if checked. least_gap, largest_gap [m] (nan: not sampled); hit_share: of
+    postures in contact.
     """
 
     links: tuple[str, str]
@@ -92,9 +93,9 @@ def self_collision_pairs(
 ) -> SelfCollisionPairs:
     """Pairs of spheres that may collide.
 
-    Omitted: links of one rigid body or joined by one joint, and `disabled` (an SRDF). Without `disabled`, pairs
-    always in contact over `num_postures` uniform postures are omitted. With `drop_never` also those never nearer than
-    NEVER_MARGIN.
+    Omitted are links of one rigid body or joined by one joint, and an SRDF's `disabled` pairs. Without `disabled`,
+    links in contact in all `num_postures` uniform postures are omitted, too; with `drop_never`, also links never
+    nearer than NEVER_MARGIN.
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
@@ -125,7 +126,7 @@ def self_collision_pairs(
 
 
 def drop_disabled(model: RobotModel, disabled: Collection[frozenset[str]]) -> Index:
-    """`self_pairs` (P, 2) without links that `disabled` (an SRDF) names."""
+    """`self_pairs` (P, 2) without links that an SRDF has `disabled`."""
     links, pairs = model.sphere_set.links, model.self_pairs()
     return np.asarray(
         pairs[np.array([frozenset((links[a], links[b])) not in disabled for a, b in pairs], dtype=bool)]
@@ -143,7 +144,7 @@ def fixtures(model: RobotModel) -> set[str]:
 def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
     """Inseparable pairs of links, and why: one rigid body, or one joint.
 
-    Fixtures are excepted from the latter.
+    A joint to a fixture does not count.
     """
     standing = fixtures(model)
     bodies = model.urdf.rigid_bodies(model.joint_names)

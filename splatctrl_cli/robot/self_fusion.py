@@ -1,7 +1,7 @@
 """Self-models learned from depth fused in each link's frame over clearly different configurations.
 
-Projective signed distances (Curless and Levoy, A volumetric method for building complex models from range images,
-1996). L links, V views, K configurations of a link, N cells, F triangles.
+Fusion of projective signed distances (Curless and Levoy, A volumetric method for building complex models from range
+images, 1996). L links, V views, K configurations of a link, N cells, F triangles.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,11 +31,11 @@ from splatctrl_cli.robot.self_model import LearnedLink, SelfModel, surface_diges
 from splatctrl_cli.robot.surface import RobotSurface
 
 REACH = 0.06  # [m] outside a link's visual surface: search distance for its parts
-MOST_REACH = 0.24  # [m]: its limit when parts extend as far
-STEP = 0.02  # [m] of some corner of a link's box between clearly different configurations
+MOST_REACH = 0.24  # [m]: limit of that distance, which grows while parts reach it
+STEP = 0.02  # [m] that a corner of a link's box moves between clearly different configurations
 FINE = 0.5  # of STEP, for a link that moves too little; its parts must leave their place by `AWAY`
 SAME = 0.5  # of the step, within which views of one moment share a configuration
-PATH_SHARE = 0.5  # of a link's way between two moments, which separates them even if it returned
+PATH_SHARE = 0.5  # of a link's path between two moments, which separates them even if the link returned
 AWAY = 0.04  # [m] from a cell's old place, beyond which a surface there is another object
 MOST_ASKED = 8  # configurations with places to check in the others
 MOST_LOST = 0.5  # of a piece's cells that may belong elsewhere
@@ -48,9 +48,9 @@ BLOCK = 3  # cells along an edge
 
 
 def choose_moments(surface: RobotSurface, T_world_link: Float64, most: int = MOST_SETS) -> list[int]:
-    """Choose `most` of M moments or fewer, in order, with the links farthest apart.
+    """Choose up to `most` of M moments, in order, with the links farthest apart.
 
-    Farthest-point sampling by the distance between postures, plus a share of the path between them.
+    Farthest-point sampling uses the distance between postures, plus `PATH_SHARE` of the path between them.
     T_world_link: (M, L, 4, 4).
     """
     corners = _boxes(surface)[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -76,13 +76,14 @@ def learn(
     name: str = "recording",
     reach: float = REACH,
 ) -> SelfModel:
-    """Self-model that V frames show, in order of time.
+    """Learn a self-model from V frames in order of time.
 
-    T_world_link (V, L, 4, 4): the surface's links; links: all of the robot's. reach [m]: search distance outside a
-    link's visual surface, grown to `MOST_REACH` with its parts. A grid cell is robot in a run of configurations if
-    `NUM_CONFIGURATIONS` show it as a surface, at most `FREE_SHARE` see through it (most views of one decide), it
-    leaves its place in the world with the link, and moves against each nearer link. A link that moves too little gets
-    configurations half as far apart. Raises InputError where no link can be learned.
+    T_world_link (V, L, 4, 4): of the surface's links; links: all of the robot's. reach [m]: search distance outside a
+    link's visual surface, doubled up to `MOST_REACH` while parts reach it. In a run of configurations, a grid cell is
+    robot if `NUM_CONFIGURATIONS` show it as surface and at most `FREE_SHARE` see through it. A configuration's views
+    decide by majority. The cell must also leave its place in the world with the link, and move against each nearer
+    link. A link that moves too little gets configurations half as far apart. Raises InputError if no link can be
+    learned.
     """
     boxes = _boxes(surface)
     corners = boxes[:, np.array(list(np.ndindex(2, 2, 2))), np.arange(3)]
@@ -126,7 +127,7 @@ class _View:
     """An image: depth (H, W) float32 [m], and its explanation.
 
     links (h, w) int16: the link that explains each `stride`-th pixel, `UNEXPLAINED`, or `EXPLAINED` by some link;
-    points_world (M, 3) [m]: unexplained.
+    points_world (M, 3) [m]: unexplained points.
     """
 
     stamp_ns: int
@@ -144,7 +145,7 @@ def _views(
 ) -> Iterator[_View]:
     """Yield frames, compared with the rendered robot.
 
-    Unexplained points within `reach` of the boxes (V, L, 2, 3) stay.
+    Unexplained points stay only within `reach` [m] of the links' boxes (V, L, 2, 3).
     """
     thinned, ratios = [], [np.zeros(1)]
     for frame, T in zip(frames, T_world_link, strict=True):
@@ -266,7 +267,7 @@ def _fuse(cells: Float64, number: int, used: Sequence[tuple[_View, int]], num: i
 def _stays_in_world(
     cells: Float64, seen: Bool, shown: Sequence[tuple[_View, int]], poses: Float64
 ) -> tuple[Bool, Bool]:
-    """True for cells (N,) that stay in the world, and for cells that move enough."""
+    """Two masks (N,): cells that stay in the world, and cells that move by `AWAY`."""
     places, votes = _move(poses, cells), np.zeros(len(cells), np.int64)
     for view, k in shown:
         for m in spread(range(len(poses)), MOST_ASKED):

@@ -17,13 +17,13 @@ TRUNCATION = 3 * VOXEL  # [m] before and behind a measured surface
 LEAST_CELLS = 24  # of a part, 1.5 cm^3
 NUM_CONFIGURATIONS = 5  # in which a cell must be a surface
 TOUCHING = np.ones((3, 3, 3))  # neighbours in one piece: thin structures lie aslant
-FEWER_CONFIGURATIONS = 3  # likewise, of a cell next to such cells
+FEWER_CONFIGURATIONS = 3  # in which a cell next to such cells must be a surface
 FREE_BESIDE = 0.5  # `FREE_SHARE` of such a cell
-SURE_SHARE = 0.25  # of a piece's cells: enough configurations show them
+SURE_SHARE = 0.25  # of a piece's cells, which enough configurations must show
 FREE_SHARE = 0.3  # of the configurations that see a cell; above it, the cell is not robot
 FREE_WEIGHT = (1 - FREE_SHARE) / FREE_SHARE  # votes against a cell of a configuration that sees through it
 AROUND = 7  # cells across: their votes choose an interval
-GONE = 0.5  # of a part's cells: free less surface, in some configuration before or after it
+GONE = 0.5  # of a part's cells, free less surface, in some configuration before and some after its interval
 MOST_INTERVALS = 6  # of a link
 
 
@@ -31,8 +31,8 @@ MOST_INTERVALS = 6  # of a link
 class Fused:
     """Depth at a link's cells in each configuration (K, N), in order of time.
 
-    total, weight float32: sum [m] and weight of distances before the surface, positive outside; seen: a surface is
-    there; free: a ray passes.
+    total, weight float32: sum [m] and weight of distances to the surface, positive outside; seen: a surface is there;
+    free: a ray passes.
     """
 
     total: Float32
@@ -41,7 +41,7 @@ class Fused:
     free: Bool
 
     def within(self, run: slice) -> tuple[Float64, Bool, Bool]:
-        """A run's mean distance (N,) [m] or NaN; seen but not free, and free (R, N)."""
+        """Mean distance (N,) [m] of a run, or NaN; `seen` without `free`, and `free`, both (R, N)."""
         total, weight = self.total[run].sum(axis=0), self.weight[run].sum(axis=0)
         mean = np.where(weight > 0.5, total / np.maximum(weight, 1e-9), np.nan).astype(np.float64)
         return mean, self.seen[run] & ~self.free[run], self.free[run]
@@ -49,7 +49,8 @@ class Fused:
     def is_robot(self, gap: Float64, run: slice, least: int, most_free: float) -> Bool:
         """True for cells (N,) inside a surface that is robot.
 
-        `least` configurations show it, at most a share `most_free` sees through; gap (N,) [m] as in `find_intervals`.
+        At least `least` configurations show the cell, at most a share `most_free` see through it. gap (N,) [m]: from
+        the link's surface.
         """
         mean, seen, free = self.within(run)
         num, num_free = seen.sum(axis=0), free.sum(axis=0)
@@ -57,7 +58,7 @@ class Fused:
         return np.asarray(is_robot & (np.maximum(np.nan_to_num(mean, nan=TRUNCATION), VOXEL - gap) < 0))
 
     def votes(self, run: slice) -> Float32:
-        """Votes (N,) of a run: surface configurations less `FREE_WEIGHT` per free one."""
+        """Votes (N,) of a run: surface configurations less `FREE_WEIGHT` per free configuration."""
         num, num_free = (self.seen[run] & ~self.free[run]).sum(axis=0), self.free[run].sum(axis=0)
         return np.asarray(num - FREE_WEIGHT * num_free, np.float32)
 
@@ -88,8 +89,9 @@ def _runs(fused: Fused) -> tuple[Index, Index]:
 def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> list[Interval]:
     """Whole recording, and intervals shared by the runs of enough connected cells.
 
-    Configurations that see through a cell bound its run. At a part's begin or end, some configuration sees through
-    `GONE` of it. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's own surface; stamps (K,) [ns].
+    Configurations that see through a cell bound its run. Before and after a part's interval, some configuration sees
+    through a share `GONE` of the part. mask (X, Y, Z): of the cells; gap (N,) [m] from the link's surface; stamps
+    (K,) [ns].
     """
     num, rows = len(stamps), np.arange(len(stamps))[:, None]
     first, last = _runs(fused)
@@ -133,8 +135,8 @@ def find_intervals(fused: Fused, mask: Bool, gap: Float64, stamps: Stamps) -> li
 def choose_intervals(fused: Fused, mask: Bool, gap: Float64, intervals: Sequence[Interval]) -> Index:
     """Number (N,) of the interval in which each cell is robot, -1 for none.
 
-    Votes of robot cells around the cell decide. In the first interval, which is the whole recording, cells next to
-    robot cells need fewer configurations.
+    Votes of robot cells around the cell decide. In the first interval, the whole recording, cells next to robot cells
+    need fewer configurations.
     """
     runs = [slice(interval.first, interval.last + 1) for interval in intervals]
     is_robot = np.array([fused.is_robot(gap, run, NUM_CONFIGURATIONS, FREE_SHARE) for run in runs])

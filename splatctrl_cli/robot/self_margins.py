@@ -1,6 +1,6 @@
 """Distances between a robot's link surfaces, and the margins that their spheres can keep.
 
-Spheres decide where far enough apart, else triangles, exactly (coal). T postures, J joints, S spheres, K pairs.
+Spheres decide if far enough apart, else triangles, exactly (coal). T postures, J joints, S spheres, K pairs.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -53,7 +53,7 @@ class LinkSurface:
         self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
-        """Largest depth [m] of points (Q, 3), link frame; 0 outside or in open surfaces."""
+        """Largest depth [m] of points (Q, 3), link frame, in closed solids; 0 outside."""
         is_near = np.zeros(len(points), dtype=np.bool_)
         for lower, upper in self._boxes:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
@@ -66,7 +66,7 @@ class LinkSurface:
 def depth_in(solid: Solid) -> Depth:
     """A function for depths (Q,) [m] in a closed solid, negative outside.
 
-    In a convex one, that is the least depth below the face planes.
+    In a convex solid, the depth is the least below any face's plane.
     """
     corners = solid.surface.corners
     normals = face_normals(corners)
@@ -82,8 +82,8 @@ def depth_in(solid: Solid) -> Depth:
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
     """Gap [m] of two surfaces, b at T_a_b (4, 4); negative where they overlap.
 
-    Exact between triangles, a lower bound for round shapes. An overlap is the deepest vertex's, at least
-    LEAST_OVERLAP.
+    The gap is exact between triangles, a lower bound for round shapes. An overlap is the deepest vertex's depth, at
+    least LEAST_OVERLAP.
     """
     T_a, T_b = coal.Transform3s(), coal.Transform3s(T_a_b[:3, :3], T_a_b[:3, 3])
     request, result = coal.DistanceRequest(), coal.DistanceResult()
@@ -98,8 +98,8 @@ def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:
 class SelfSurfaces:
     """Pairs of links that may collide, judged by surfaces; without surfaces, by spheres.
 
-    pairs: links that may collide, and are apart in some posture; fused: never apart. names (K + P): of these and of P
-    pairs of spheres on bodies without geometry.
+    pairs (K): links that may collide, and are apart in some posture; fused: links never apart. names (K + P): of
+    `pairs`, and of P pairs of spheres on bodies without geometry.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class SelfSurfaces:
     def gaps(self, q: Float64, centers: Float64, enough: float) -> Float64:
         """Gaps (T, K + P) [m] at postures (T, J).
 
-        centers: (T, S, 3). Links' gaps are exact below `enough` [m], else lower bounds above it.
+        centers: (T, S, 3). Links' gaps below `enough` [m] are exact; larger ones may be lower bounds.
         """
         gaps = self._bounds(self.pairs, centers)
         for state, pair in np.argwhere(gaps < enough):
@@ -151,7 +151,7 @@ class SelfSurfaces:
         return np.concatenate([gaps, bare], axis=1)
 
     def _bounds(self, pairs: Sequence[LinkNames], centers: Float64) -> Float64:
-        """Gaps (T, K) [m] of rigid bodies' spheres, grown by the uncovered surface."""
+        """Gaps (T, K) [m] between rigid bodies' spheres, grown by the uncovered surface."""
         bodies = np.array([[self._body.get(self._leaders[link], -1) for link in pair] for pair in pairs])
         bounds = np.full((len(centers), len(pairs)), -np.inf)
         known = np.flatnonzero((bodies.reshape(-1, 2) >= 0).all(axis=1))
@@ -166,7 +166,7 @@ class SelfSurfaces:
         return next((number for number, own in enumerate(self.pairs) if own in (pair, pair[::-1])), None)
 
     def gaps_of(self, pair: LinkNames, q: Float64, centers: Float64, enough: float = np.inf) -> Float64 | None:
-        """One pair's gaps (T,) [m], as `gaps`; None for no such pair."""
+        """Gaps (T,) [m] of one pair, as in `gaps`; None for an unknown pair."""
         if self.number_of(pair) is None:
             return None
         gaps = self._bounds([pair], centers)[:, 0]
@@ -186,11 +186,11 @@ class SelfSurfaces:
 
 @dataclass(frozen=True, kw_only=True)
 class KeptMargin:
-    """Two links whose spheres keep `margin` [m] instead of the configured one.
+    """Two links whose spheres have a `margin` [m] of their own.
 
-    margin: negative if the spheres may overlap; None: inseparable, the configured one stays. apart: least gap [m] of
-    their surfaces (spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one is in `fixtures`.
-    surface_gap: least gap [m] of their surfaces in sampled postures that keep the margin, None if unknown.
+    margin: negative if the spheres may overlap; None: the configured margin stays. apart: least gap [m] of their
+    surfaces (spheres if unknown) that is not *near* (`kept_margins`). is_fixture: one link is in `fixtures`.
+    surface_gap: least gap [m] of their surfaces in postures whose sphere gap reaches the margin, None if unknown.
     """
 
     links: tuple[str, str]
@@ -203,7 +203,7 @@ class KeptMargin:
 def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) -> tuple[KeptMargin, ...]:
     """Pairs of a moving link and one of `fixtures`, which no map contains.
 
-    They keep `margin` [m], or a share of their largest gap if that is less.
+    Their `apart` is `margin` [m], or SELF_SHARE of their largest gap if that is less.
     """
     standing, postures = fixtures(model), random_postures(model, SELF_TOUCHING, seed=0)
     return tuple(
@@ -220,12 +220,12 @@ def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) ->
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:
-    """Pairs whose spheres often break `margin` [m], with the margin they keep.
+    """Pairs whose spheres are often nearer than `margin` [m], with a lower margin.
 
-    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* where the surfaces are within the
-    lesser of the margin and half their largest gap. The margin kept is the largest sphere gap in near postures, if
-    most other postures have a larger one. Else it is the gap that nearly all others exceed; with unknown surfaces, at
-    least 0.
+    Often: in SELF_OFTEN of SELF_POSTURES random postures. A posture is *near* if the surfaces are nearer than the
+    margin and half their largest gap. The lower margin is the sphere gap that nearly all other postures exceed. It
+    rises to the largest gap of near postures, if most others exceed that. With unknown surfaces no posture is near,
+    and it is at least 0.
     """
     names = model.sphere_set.links
     owners = [(names[a], names[b]) for a, b in model.self_pairs()]

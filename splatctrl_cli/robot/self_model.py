@@ -19,13 +19,13 @@ BOUNDS = ("start_ns", "end_ns", "first_ns")  # missing from files of earlier ver
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLink:
-    """A link seen in clearly different configurations, or a temporary part: a grasped object.
+    """A link's parts beyond its visual surface: permanent, or a grasped object.
 
-    Its parts last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's
-    centre; voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8 with a surface;
-    triangles (F, 3, 3) [m], link frame: closed surfaces of parts beyond the visual surface. outside_95, outside_most
-    [m]: protrusion of 95 % and all of their cells, most at place (3,) [m]; since [s] from the first frame: when
-    knowable. Without parts 0 and NaN. first_ns [ns]: first frame.
+    They last from start_ns to end_ns [ns], `ALWAYS` if unbounded. origin (3,) [m], link frame: first cell's centre;
+    voxel [m]; distance (X, Y, Z) float32 [m], NaN if unknown; configurations (X, Y, Z) uint8: number with a surface;
+    triangles (F, 3, 3) [m], link frame: the parts' closed surfaces. outside_95, outside_most [m]: protrusion of 95 %
+    of their cells, and the largest, at place (3,) [m]; since [s]: from the first frame until they were knowable.
+    Without parts, protrusions are 0, place and since NaN. first_ns [ns]: first frame.
     """
 
     link: str
@@ -96,7 +96,7 @@ class SelfModel:
         return sorted({stamp for part in self.temporary for stamp in (part.start_ns, part.end_ns)} - set(ALWAYS))
 
     def arrays(self) -> dict[str, Array]:
-        """All of it by name, for a file."""
+        """All fields by name, for a file."""
         keys = [f"{part.link} {number}" for number, part in enumerate(self.learned)]
         rows = zip(keys, self.learned, strict=True)
         return {
@@ -109,7 +109,7 @@ class SelfModel:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> Self:
-        """Read `arrays`. Raises KeyError, TypeError or ValueError for others."""
+        """Read `arrays`. Raises KeyError, TypeError or ValueError for other arrays."""
         names = [field.name for field in fields(LearnedLink)]
         rows = [
             {name: arrays[f"{key}.{name}"] for name in names if f"{key}.{name}" in arrays or name not in BOUNDS}
@@ -126,7 +126,7 @@ class SelfModel:
         return cls(links=links, digest=str(arrays["digest"]), learned=tuple(learned), unknown=unknown)
 
     def check_robot(self, surface: RobotSurface, links: Sequence[str], path: Path) -> None:
-        """Raise InputError if file `path` belongs to a robot of other links or visual surface."""
+        """Raise InputError if file `path` belongs to a robot with other links or visual surface."""
         other = ", ".join(sorted(set(self.links) ^ set(links))[:4])
         difference = f"one of the two lacks {other}" if other else "its visual geometry differs"
         refuse_if(

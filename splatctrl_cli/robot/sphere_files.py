@@ -1,8 +1,8 @@
 """Collision spheres of a robot: files, matching to URDF links, and joints' lever arms.
 
 Files are URDFs, and YAML of this tool, robometrics and cuRobo. As in cuRobo (NVlabs/curobo, cuda_robot_generator.py),
-`collision_sphere_buffer`, a number or one per link, adds to every radius; `collision_spheres` may name a file; a
-sphere whose radius is then not above 0 is switched off.
+`collision_sphere_buffer`, a number or one per link, adds to every radius; a sphere whose radius is then not above 0
+is switched off. `collision_spheres` may name a file.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ RENAMED = (
 
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
-    """`own_spheres`. Raises InputError without any."""
+    """`own_spheres`. Raises InputError without spheres."""
     spheres = own_spheres(urdf)
     others = len(urdf.meshes) + len(urdf.other_shapes) + sum(shape.kind != "sphere" for shape in urdf.shapes)
     refuse_if(
@@ -39,10 +39,7 @@ def spheres_of(urdf: UrdfFile) -> SphereSet:
 
 
 def own_spheres(urdf: UrdfFile) -> SphereSet:
-    """Spheres of a URDF with no other collision geometry.
-
-    Else none.
-    """
+    """Spheres of a URDF, none if it has other collision geometry."""
     has_others = urdf.meshes or urdf.other_shapes or any(shape.kind != "sphere" for shape in urdf.shapes)
     shapes = () if has_others else urdf.shapes
     return SphereSet(
@@ -66,10 +63,10 @@ def add_boxes(spheres: SphereSet, boxes: Sequence[tuple[str, Box]]) -> SphereSet
 
 
 def match_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[SphereSet, tuple[str, ...]]:
-    """Spheres by the URDF's link names, and the links missing there.
+    """Spheres by the URDF's link names, and other links, whose spheres are left out.
 
-    Those are left out. If no name agrees, names are compared without their first part: `panda_link1` fits
-    `fr3_link1`. Raises InputError about `name` if nothing fits.
+    If no name agrees, names are compared without their first part: `panda_link1` fits `fr3_link1`. Raises InputError
+    about `name` if nothing fits.
     """
     names = {link: link for link in urdf.links}
     file_links = spheres.links
@@ -99,9 +96,9 @@ def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
 def lever_arms(chain: Chain, lower: Float64, upper: Float64) -> Float64:
     """Bounds (S, J) on a centre's travel per radian (or metre) within the limits.
 
-    About its own joint the centre moves on a circle, inside a ball about its middle. Each joint towards the base
-    moves that middle on a circle; the ball grows by its distance from the axis. 0 where the joint does not move the
-    sphere.
+    In each body's frame, the sphere's centre stays within a ball. At a revolute joint, the ball grows by its centre's
+    distance from the axis, and its radius is the bound. A prismatic joint has the bound 1, a joint that does not move
+    the sphere 0.
     """
     levers = np.zeros((len(chain.sphere_body), len(chain.parent) - 1))
     for s, (start, offset) in enumerate(zip(chain.sphere_body, chain.offset, strict=True)):
@@ -136,15 +133,15 @@ class SphereFile:
 
 
 def read_spheres(path: Path) -> SphereSet:
-    """Spheres of a file [m]; see `read_sphere_file`."""
+    """Spheres of a file [m] (`read_sphere_file`)."""
     return read_sphere_file(path).spheres
 
 
 def read_sphere_file(path: Path) -> SphereFile:
     """Read the spheres of a YAML file or a URDF.
 
-    `collision_spheres` at the top or under robot_cfg.kinematics, by link or as Lula's list, or an XRDF's groups.
-    Raises InputError for an unreadable file, another layout, a non-finite number, or no sphere.
+    YAML has `collision_spheres` at the top or under robot_cfg.kinematics, by link or as Lula's list, or an XRDF's
+    groups. Raises InputError for an unreadable file, another layout, a non-finite number, or no sphere.
     """
     if path.suffix.lower() in URDF_SUFFIXES:
         return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)

@@ -1,13 +1,13 @@
 """Spheres that cover a robot's collision surface and protrude as little as their number allows.
 
 A ball at c that may protrude by t has the radius t - d(c), d the signed distance to the body (negative inside). The
-surface is cut into small triangles ("patches"); a ball holds a patch if it holds its corners. Covering patch p from
-centre c takes the protrusion
+surface is cut into small triangles ("patches"); a ball covers a patch if it contains its corners. A ball at c that
+covers patch p protrudes by
 
-    K[c, p] = max_k |v_pk - c| + d(c),
+    K[c, p] = max_k |v_pk - c| + d(c).
 
-and the best n spheres are a k-centre problem: minimise the largest over p of the least K over centres. Greedy set
-cover at a bisected t gives centres, which alternating assignment and recentring improve; then balls shrink.
+The best n centres minimise the largest of the patches' least K, a k-centre problem. Greedy set cover at a bisected t
+gives centres, which alternating assignment and recentring improve; then balls shrink.
 """
 
 import hashlib
@@ -45,9 +45,9 @@ DIGITS = 6  # decimals of a written sphere: micrometres
 class FitOptions:
     """Requirements on the spheres.
 
-    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: of
-    surface points outside. restarts: greedy covers per link and protrusion; num_patches, num_candidates: approximate,
-    per link.
+    max_spheres: over all links; or max_protrusion [m], met by few spheres. max_deficit [m]: largest distance of
+    surface points outside. restarts: number of greedy covers per link and protrusion; num_patches, num_candidates:
+    approximate, per link.
     """
 
     max_spheres: int | None = None
@@ -124,7 +124,7 @@ def _check(options: FitOptions, num_links: int) -> None:
 
 
 def _share_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
-    """Distribute `budget` spheres: one t for all links, the rest to the most protruding."""
+    """Distribute `budget` spheres: by one t for all links, then to the most protruding links."""
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
     for _ in range(FIT_BISECTIONS):
@@ -174,13 +174,13 @@ class _Link:
         self._depth = self._distance(self._candidates)
         self._cost = self._reach(self._candidates) + self._depth[:, None]
         alone = self._cost.max(axis=1)
-        self.middle = int(np.argmin(alone))  # the candidate that covers the link alone at the least protrusion
+        self.middle = int(np.argmin(alone))  # the candidate that alone covers the link, at the least protrusion
         self.single = float(alone[self.middle])
 
     def cover(self, t: float, *, at_most: int) -> Index | None:
-        """Candidates (n,) whose balls of protrusion t hold every patch, by greedy passes.
+        """Candidates (n,) whose balls of protrusion t cover every patch, by greedy passes.
 
-        None beyond `at_most`, or if t is too small for a patch.
+        None if that takes more than `at_most`, or t is too small for a patch.
         """
         holds = self._cost <= t
         if not holds.any(axis=0).all():
@@ -194,7 +194,7 @@ class _Link:
         return None if best is None else np.array(best, dtype=np.int64)
 
     def within(self, max_protrusion: float) -> tuple[Float64, Float64]:
-        """Few spheres within a protrusion. Raises UsageError where the patches are too coarse."""
+        """Few spheres within a protrusion [m]. Raises UsageError if too small for a patch."""
         least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
         cover = require(
             self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1]),
@@ -232,7 +232,7 @@ class _Link:
         return self._polish(centers)
 
     def round_outward(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
-        """Spheres at rounded centres, as small as patches and then the whole surface allow."""
+        """Spheres at rounded centres, as small as the whole surface allows."""
         owner, _ = self._assign(centers)
         centers = centers[np.unique(owner)].round(DIGITS)
         owner, _ = self._assign(centers)
@@ -244,7 +244,7 @@ class _Link:
             largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
             for part in self._parts
         )
-        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that the proven bound stays within it
+        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that the proven bound is at most max_deficit
         radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
@@ -297,7 +297,7 @@ def _recentre(
 
 
 def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:
-    """Pick candidates for the most pending patches each; with `rng`, one of the best."""
+    """Pick candidates that cover most pending patches; with `rng`, at random among nearly the best."""
     pending = np.ones(len(by_patch), dtype=np.bool_)
     gain = by_patch.sum(axis=0, dtype=np.int32)
     picked: list[int] = []

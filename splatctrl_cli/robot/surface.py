@@ -36,9 +36,9 @@ class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
     kinds (P,), sizes (P, 3) as in `kernels.surface_image`; T_link_solid (P, 4, 4); triangles (F, 3, 3) in the frame
-    of triangle_links (F,), as a `mesh` to draw and `trees` by link number to measure. by_spheres: links whose
-    unreadable geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that no joint moves.
-    num_carried: carried boxes, each with its link again at the end of `links`.
+    of triangle_links (F,); mesh draws the triangles, trees (by link number) measure them. by_spheres: links whose
+    missing geometry spheres replace. notes: replaced visual geometry, and why. fixed: links that no joint moves.
+    num_carried: number of carried boxes, whose links are repeated at the end of `links`.
     """
 
     links: tuple[str, ...]
@@ -57,9 +57,9 @@ class RobotSurface:
 
     @classmethod
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
-        """Build the visual geometry of a URDF, else collision geometry, else spheres, by link.
+        """Build each link from visual geometry, else collision geometry, else spheres.
 
-        folders: as in `read_solids`. Raises InputError for a mesh in another unit.
+        folders: for ``package://``. Raises InputError for a mesh in another unit.
         """
         seen = visual_urdf(urdf)
         pieces, unread = _read(seen, folders)
@@ -158,11 +158,11 @@ class RobotSurface:
 
     @property
     def is_drawn(self) -> bool:
-        """True if visual meshes cover every link: all inside is robot."""
+        """True if visual meshes cover every link, so that all inside is robot."""
         return bool(self.trees) and not self.notes and not self.vague
 
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
-        """(L, 4, 4) of `links`, from poses by name."""
+        """Poses (L, 4, 4) of `links`, from poses by name."""
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
 
     def extents(self, T_world_link: Float64) -> dict[str, list[float]]:
@@ -222,8 +222,8 @@ class RobotSurface:
     ) -> Float64:
         """Signed distances (Q,) [m] of points (Q, 3), negative inside.
 
-        Infinite to triangles beyond `within` (Q,) [m]. With `enough` (Q,) [m] of at least 0, any distance on the same
-        side of both. Points `outside` (Q,) skip the inside test.
+        Triangles beyond `within` (Q,) [m] are infinitely far. With `enough` (Q,) [m] >= 0, the result only lies on
+        the true side of `within` and `enough`. Points `outside` (Q,) skip the inside test.
         """
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
         counts = np.array([link not in without for link in self.links], bool)
@@ -241,7 +241,7 @@ class RobotSurface:
     ) -> Float64:
         """Signed distances (Q,) [m] of points (Q, 3), link frame, to one link.
 
-        Carried boxes count. outside (Q,): known outside; within [m]: as in `distance`.
+        Carried boxes count. outside (Q,), within [m]: as in `distance`.
         """
         still, others = np.tile(np.eye(4), (len(self.links), 1, 1)), [name for name in self.links if name != link]
         return self.distance(still, points, without=others, within=within, outside=outside)
@@ -249,7 +249,7 @@ class RobotSurface:
     def gaps(self, link: str, T_world_link: Float64, centers: Floats, radii: Floats) -> Float64:
         """A link's signed gap (T,) [m] to the nearest ball; infinite without balls.
 
-        Carried boxes count. Balls (N, 3), (N,) [m]; T_world_link (T, 4, 4).
+        Carried boxes count. Balls: centers (N, 3), radii (N,) [m], world. T_world_link (T, 4, 4).
         """
         numbers = [number for number, name in enumerate(self.links) if name == link]
         to_link = np.asarray(np.linalg.inv(T_world_link), np.float64)

@@ -87,8 +87,8 @@ class UrdfFile:
     def rigid_bodies(self, movable: Collection[str] | None = None) -> dict[str, tuple[str, Float64]]:
         """Leader of each link's rigid body, and T_leader_link (4, 4).
 
-        Fixed joints merge links; the one nearest to the root leads. movable: joints that move (default: all not
-        fixed); the others are at 0.
+        Fixed joints merge links; the link nearest to the root leads. movable: joints that move (default: all not
+        fixed); other joints are at 0.
         """
         still = {
             joint.child: joint
@@ -108,7 +108,8 @@ class UrdfFile:
     def grippers(self) -> tuple[str, ...]:
         """Joints typical of fingers.
 
-        Several prismatic joints on one rigid body, or mimics and their leaders, without another kind of joint beyond.
+        Several prismatic joints on one rigid body, or mimics and the joints they follow, if they carry no other
+        joint.
         """
         movable = [joint for joint in self.joints if joint.kind != "fixed"]
         leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
@@ -125,9 +126,9 @@ class UrdfFile:
         return tuple(joint.name for joint in movable if joint.name in names - carries_others)
 
     def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
-        """`grippers` that stand still while the `moved` joints move.
+        """`grippers` that `moved` joints carry, but do not move.
 
-        Neither before a moved joint nor in step with one.
+        None leads to a moved joint, or shares a mimic with one.
         """
         by_name = {joint.name: joint for joint in self.joints}
         busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
@@ -144,7 +145,7 @@ class UrdfFile:
             yield joint.name
 
     def add_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
-        """`locked` values, with unnamed joints that mimic them."""
+        """Values of `locked` joints, and of joints that mimic them."""
         followers = {
             joint.name: joint.mimic[1] * locked[joint.mimic[0]] + joint.mimic[2]
             for joint in self.joints
@@ -202,7 +203,7 @@ def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
 
 
 def visual_urdf(urdf: UrdfFile, without: Collection[str] = ()) -> UrdfFile:
-    """URDF with visual instead of collision geometry where a link has some, not `without`."""
+    """URDF in which visual geometry replaces collision geometry, except in links `without`."""
     root = ElementTree.fromstring(urdf.text)
     for link in root.findall("link"):
         is_seen = link.get("name") not in without

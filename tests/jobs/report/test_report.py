@@ -124,7 +124,9 @@ def test_a_click_in_the_timeline_moves_the_arm_and_the_pointer_reads_values(run:
       found.words = line.parentElement.querySelector(".hover").textContent;"""
     found = shown(folder, script)
     assert 0.3 < found["state"] / found["most"] < 0.7
-    assert re.fullmatch(r"\d+\.\d\d s; to the splats -?[\d.]+ mm; by the controller's field -?[\d.]+ mm", found["words"])
+    assert re.fullmatch(
+        r"\d+\.\d\d s; to the splats -?[\d.]+ mm; by the controller's field -?[\d.]+ mm", found["words"]
+    )
 
 
 def test_a_moved_scene_is_found_below_root_and_a_changed_robot_is_refused(run: Runs, tmp_path: Path) -> None:
