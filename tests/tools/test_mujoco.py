@@ -31,6 +31,7 @@ from tools.mujoco.cell import Cell, Lens, as_piece  # noqa: E402
 from tools.mujoco.depth import COUNT, DEPTH_LENS, Laser, Stereo, aligned  # noqa: E402
 from tools.mujoco.images import Camera, Studio, views_of  # noqa: E402
 from tools.mujoco.poses import Float64, inverse, look_at, moved, pose, turn_rpy  # noqa: E402
+from tools.mujoco.recording import ON_SITE, _static_transforms, draw  # noqa: E402
 from tools.mujoco.robots import ROBOTS, Piece, load_robot  # noqa: E402
 from tools.mujoco.solids import Solid, Track, fixed, frusta, signed_distance  # noqa: E402
 from tools.mujoco.stage import bottle, room  # noqa: E402
@@ -264,6 +265,13 @@ def test_a_recording_is_whole_and_the_same_twice(
     assert main(["info", str(folder / said["log"]), "--json"]) == 0
     shown = capsys.readouterr().out
     assert all(camera in shown for camera in said["cams"])
+
+
+def test_from_a_seed_on_the_world_stands_somewhere_in_the_root_frame_of_the_log() -> None:
+    edges = {seed: _static_transforms(draw(seed, 0)) for seed in (ON_SITE - 1, ON_SITE)}
+    assert [{parent for parent, _, _ in its} >= {"site"} for its in edges.values()] == [False, True]
+    (T,) = [T for parent, child, T in edges[ON_SITE] if (parent, child) == ("site", "world")]
+    assert np.linalg.norm(T[:3, 3]) > 0.1 and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)
 
 
 def _theirs(entry: dict[str, object], times: Float64, rows: Float64) -> Solid:

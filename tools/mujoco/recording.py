@@ -11,7 +11,7 @@ from tools.mujoco.cell import Cell
 from tools.mujoco.depth import Laser, Stereo, draw_sensor
 from tools.mujoco.families import FAMILIES, ORDER
 from tools.mujoco.images import Studio, views_of
-from tools.mujoco.poses import Float64, inverse
+from tools.mujoco.poses import Float64, inverse, pose, turn_rpy
 from tools.mujoco.robots import ROBOTS, Robot, load_robot, write_tight_urdf
 from tools.mujoco.stage import DURATION_S, NoPlaceError, Stage
 from tools.mujoco.topics import Log, Transform, camera_transforms, log_name, opened_log
@@ -24,6 +24,7 @@ SEG_EVERY = 5  # frames
 DEPTH_SHARES = {"ideal": 0.2, "mild": 0.3, "real": 0.4, "laser": 0.1}
 FORMAT_SHARES = {"mcap": 0.7, "sqlite": 0.15, "bag": 0.15}
 TRIES = 20
+ON_SITE = 61  # first seed whose robot does not stand at the origin of the log's root frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +38,15 @@ class Plan:
     sensor: Stereo | Laser | None
     kind: str
     stage: Stage
+
+    @property
+    def T_site_world(self) -> Float64 | None:
+        """Where the log has the world (4, 4), None at its origin: a cell in a hall, or an arm that hangs or leans."""
+        if self.seed < ON_SITE:
+            return None
+        rng = np.random.default_rng([self.seed, self.index, 3])
+        lean = rng.choice([0.0, np.pi / 2, np.pi], p=[0.7, 0.15, 0.15])
+        return pose(rng.uniform([-3, -3, 0], [3, 3, 1]), turn_rpy([lean, 0.0, rng.uniform(-np.pi, np.pi)]))
 
     @property
     def name(self) -> str:
@@ -113,6 +123,7 @@ def write(plan: Plan, folder: Path) -> None:
         "object": seen.solid[worst],
         "mujoco_difference": mujoco_difference(world, float(times[worst]), q[worst]),
         "K": {camera.name: camera.lens.matrix.tolist() for camera in plan.stage.cameras},
+        "T_site_world": None if plan.T_site_world is None else plan.T_site_world.tolist(),
         "pose_errors": {name: T.tolist() for name, T in plan.stage.pose_errors.items()},
         "phases": {camera.name: camera.phase for camera in plan.stage.cameras},
         "solids": [solid_document(solid) for solid in plan.stage.solids],
@@ -156,8 +167,10 @@ def _log_state(robot: Robot, log: Log, time: float, q: Float64, velocity: Float6
 
 
 def _static_transforms(plan: Plan) -> list[Transform]:
-    """The robot's root in the world, and every camera where the log says it is."""
-    out: list[Transform] = [] if plan.stage.robot.root == "world" else [("world", plan.stage.robot.root, np.eye(4))]
+    """The world at a site, the robot's root in the world, and every camera where the log says it is."""
+    out: list[Transform] = [] if plan.T_site_world is None else [("site", "world", plan.T_site_world)]
+    if plan.stage.robot.root != "world":
+        out.append(("world", plan.stage.robot.root, np.eye(4)))
     for camera in plan.stage.cameras:
         T = camera.T_parent_camera @ plan.stage.pose_errors.get(camera.name, np.eye(4))
         out += camera_transforms(camera, T, camera.link or "world")
