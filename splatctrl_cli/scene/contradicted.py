@@ -1,6 +1,6 @@
 """Evidence of a time step: masks of its frames, and rays that another frame contradicts.
 
-The depth of a shiny or dark object may be far too large, or missing. Such rays go through a surface that another
+The depth of a shiny or dark object may be far too large, or missing. Its rays then go through a surface that another
 camera measures.
 """
 

@@ -102,7 +102,7 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
     """Splats (M,) in voxels that human pixels hit.
 
-    Human splats stay human while one of the eight nearest voxels is human.
+    Human splats stay human while one of the eight nearest voxels is.
     """
     is_in = occupancy.entity_at(buffer.centers) & Label.HUMAN > 0
     was_human = buffer.is_alive & (buffer.labels == Label.HUMAN)

@@ -173,7 +173,7 @@ class OccupancyMap:
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
-        """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark these voxels swept."""
+        """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark them swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         native.mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 

@@ -52,7 +52,7 @@ class RobotPosture:
         )
 
     def is_within(self, points_world: Floats, reach: Floats | float, *, to_moving: bool = False) -> Bool:
-        """True for points (N, 3) within signed distance `reach` (N,) [m]; much faster than `distance`."""
+        """True for points (N, 3) at a signed distance of at most `reach` (N,) [m]; faster than `distance`."""
         distance = self.distance(points_world, to_moving=to_moving, within=np.maximum(reach, 0.0), enough=reach)
         return np.asarray(distance <= reach)
 

@@ -199,7 +199,7 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Fill dead slots beyond the reserve by `when_idle`; count weak splats removed, too.
+    """Fill dead slots beyond the reserve by `when_idle`; count weak splats removed.
 
     misfits: returns each view's misfit, and each slot's blended opacity (M,).
     """
