@@ -62,7 +62,7 @@ def refuse_faults(
     remedy: str = "",
     error: Callable[..., Exception] = InputError,
 ) -> Iterator[None]:
-    """Raise ``what: fault``, or `what` of the fault, for one of these faults in the block."""
+    """Raise ``what: fault``, or ``what(fault)``, for one of `faults` in the block."""
     try:
         yield
     except faults as fault:

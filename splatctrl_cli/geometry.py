@@ -25,7 +25,7 @@ def transform_points(T: Float64, points: Floats) -> Float64:
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
     """Rotation of a finite, nonzero quaternion.
 
-    It is scaled first, as squares of a tiny one would underflow; a power of two does not round.
+    It is first scaled by a power of two, which does not round: squares of tiny numbers would underflow.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     quat = np.ldexp(quat, -np.frexp(np.abs(quat).max())[1])

@@ -70,8 +70,8 @@ class Intrinsics:
 class RgbdFrame:
     """A colour image with registered depth and pose.
 
-    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = no return; T_world_camera (4, 4)
-    float64, of the optical frame (z forward); human (H, W) uint8, nonzero on people, or None; valid (H, W), False
+    color (H, W, 3) uint8 RGB. depth (H, W) float32 [m] along the optical axis, 0 = no return. T_world_camera (4, 4)
+    float64, of the optical frame (z forward). human (H, W) uint8, nonzero on people, or None. valid (H, W), False
     outside the lens's view, None if all valid. Invalid pixels have no colour; their depth is not drawn or scored.
     """
 
@@ -94,7 +94,7 @@ class RgbdFrame:
 class JointState:
     """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in source order.
 
-    Where logged: commanded_velocity (J,) [1/s], and the robot's own end-effector pose (4, 4), in its base or world.
+    Where logged: commanded_velocity (J,) [1/s], and the robot's own end-effector pose (4, 4), in base or world frame.
     """
 
     stamp_ns: int
@@ -125,10 +125,10 @@ def merge_by_stamp(*streams: Iterable[Item]) -> Iterator[Item]:
 class LossReport:
     """Losses of an input: `damaged` sets exit code 3, the rest is only counted.
 
-    duplicate_images: images of a stamp that their topic had before; dropped_images: missing from a topic of steady
-    rate; invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return;
-    differentiated_velocities: states with a velocity from positions; unsorted_states, duplicate_states: stamps that
-    go back or repeat; conflicting_states: duplicates with other positions; state_gaps: times without states.
+    duplicate_images: images of a stamp that their topic had before. dropped_images: images missing from a topic of
+    steady rate. invalid_depth: pixels with NaN, infinite, negative or 65535 counts, read as no return.
+    differentiated_velocities: states with a velocity from positions. unsorted_states, duplicate_states: states whose
+    stamp goes back or repeats. conflicting_states: duplicates with other positions. state_gaps: times without states.
     """
 
     unpaired_color: int = 0
@@ -173,7 +173,10 @@ class RecordSource(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Arrays with one row per item (N), the first field too; numbers hold for all items."""
+    """Arrays with one row per item (N), and numbers for all items.
+
+    The first field is an array.
+    """
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
@@ -274,7 +277,7 @@ class DistanceField(Protocol):
     """Signed distance to the scene, positive outside."""
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Distance (Q,) [m] at points (Q, 3) [m], world, and its own gradient (Q, 3).
+        """Distance (Q,) [m] at points (Q, 3) [m], world, and its gradient (Q, 3).
 
         The gradient is not normalised.
         """

@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.records import Bool, Columns, Float32, Float64, Floats, Index, UInt8, UInt16
 
 MOST_VOXELS = 400_000_000  # of a grid
-FIRST_REASON = 0xF0  # in one byte (0xFFF0 in two): from here on `last_seen` is the reason of a never-seen voxel
+FIRST_REASON = 0xF0  # `last_seen` from here on (0xFFF0 in two bytes) is the reason why a voxel was never seen
 SWEPT = 0b100  # entity bit of a voxel that the robot occupied at some time
 SOLID = 0b1000  # entity bit, with a known robot: an object's pixel hit the voxel after its last free view
 
@@ -36,7 +36,7 @@ class VoxelState(IntEnum):
 class Unseen(IntEnum):
     """Reason why no camera got depth through or on a voxel (two-byte `last_seen`).
 
-    The largest of several cameras' reasons counts; the last two stay until a ray passes.
+    The largest of several cameras' reasons counts. The last two reasons stay until a ray passes.
     """
 
     SWEPT = 0xFFF0  # the robot's body was in it
@@ -56,7 +56,7 @@ class EvidenceClass(IntEnum):
     STALE = 2  # seen too long ago
     HIDDEN_BY_ARM = 3
     HIDDEN_BY_THING = 4
-    OUT_OF_VIEW = 5  # of all cameras; or without a reason, far from the arm
+    OUT_OF_VIEW = 5  # in no camera's view; or without a recorded reason, far from the arm
     NO_RETURN = 6  # no depth in its pixel, which may show empty background
     CONTRADICTED = 7
     UNANSWERED = 8  # no depth where some is expected
@@ -150,7 +150,7 @@ class SeenVoxels:
     """Last view of each voxel, centred at `origin` + index times `voxel` [m].
 
     last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last step with depth
-    through or on the voxel; 0: never; the type's largest numbers: the reason (`Unseen`, its lower byte in uint8).
+    through or on the voxel. 0: never. The type's largest numbers: the reason (`Unseen`, its lower byte in uint8).
     edges: of the newest images. is_free (X, Y, Z): `VoxelState.FREE` now; None if not recorded.
     """
 
@@ -184,7 +184,8 @@ _CLASS_OF[[1 + (reason & 0xF) for reason in Unseen]] = [EvidenceClass[reason.nam
 class KnownVoxels:
     """State of space at one moment, and its evidence's age.
 
-    last_seen, step_stamps_ns, edges: as in `SeenVoxels`. unrepresented: occupied, not robot, without a splat.
+    last_seen, step_stamps_ns, edges: as in `SeenVoxels`. unrepresented: occupied voxels without a splat, except the
+    robot's.
     """
 
     grid: OccupancyGrid

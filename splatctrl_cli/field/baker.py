@@ -29,8 +29,8 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """Channels of a field over splats at the cells of `layout`.
 
-    Planes and threads change no bit. counts: ``se_without_value``, cells with exact distance instead;
-    ``se_over_estimates``, cells above the exact one by over `RESOLUTION`; likewise gpdf.
+    Planes and threads do not change the bytes. counts: ``se_without_value``, cells with exact distance instead;
+    ``se_over_estimates``, cells above the exact distance by over `RESOLUTION`; likewise gpdf.
     """
 
     def __init__(
@@ -45,9 +45,10 @@ class Baker:
         threads: int = 0,
         device: Memory | None = None,
     ) -> None:
-        """device: a card that computes instead of the processor, without masks.
+        """device: a card that computes instead of the processor; it supports no masks.
 
-        Raises as `Spheres.of`; UsageError for unknown channels, or without sdf.
+        Raises UsageError for unknown channels or without sdf, NotEvaluableError without splats, InputError for
+        invalid ones.
         """
         unknown = [name for name in channels if name not in CHANNELS]
         refuse_if(
@@ -217,7 +218,7 @@ def _cells(mask: UInt8, span: GridSpan) -> Bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Mask (blocks of the grid): 1 where a bake is needed; None: everywhere, for `reason`."""
+    """Blocks of the grid to bake: mask, 1 where needed; None: all, for `reason`."""
 
     mask: UInt8 | None
     num_blocks: int
@@ -229,9 +230,9 @@ class Changes:
 
 
 def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
-    """Blocks where bakes of `before` and `after` can differ by a bit.
+    """Blocks whose baked bytes can differ between `before` and `after`.
 
-    A block can differ if a splat of only one set reaches it, by the bake's culling bounds, or if weights differ.
+    A block can differ if a splat of only one set, or of changed weight, reaches it by the bake's culling bounds.
     """
     shape = tuple(-(-cells // BLOCK) for cells in new.layout.shape)
     num_blocks = int(np.prod(shape))
@@ -243,7 +244,7 @@ def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) ->
     for with_weights in (False, True) if "se" in new.kernels else (False,):
         both = _changed((before, after), (old, new), with_weights=with_weights)
         for changed, baker in zip(both, (old, new), strict=True):
-            se = baker.kernels["se"] if with_weights else None  # ``2 l^2 log |w_i|``; else the radii, and no length
+            se = baker.kernels["se"] if with_weights else None  # offsets: ``2 l^2 log |w_i|``, else radii
             offsets, length = (baker.exact.radii, 0.0) if se is None else (se.terms().offsets, se.kernel.length)
             if changed.any():
                 native.field_touched(
@@ -286,7 +287,7 @@ def _reason_for_all(old: Baker, new: Baker) -> str:
 def _changed(
     splats: tuple[SplatSet, SplatSet], bakers: tuple[Baker, Baker], *, with_weights: bool
 ) -> tuple[UInt8, UInt8]:
-    """Entries (16 C,) of each set missing in the other, to the bit."""
+    """Entries (16 C,) of each set without an equal in the other."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
     _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
     old_kinds, new_kinds = np.split(kinds, [len(rows[0])])
@@ -301,7 +302,7 @@ def _changed(
 def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
     """Splats as bytes (N,), in cluster order.
 
-    A rank separates splats of one centre.
+    A rank separates splats with the same centre.
     """
     order = baker.spheres.source[baker.spheres.is_point.view(np.bool_)]
     centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0

@@ -1,6 +1,6 @@
 """Spheres of a scene's field: chosen by label, checked and clustered once.
 
-A space-filling curve sorts points into clusters of 16, and these into groups of 16, with boxes.
+A space-filling curve sorts points into clusters of 16, and clusters into groups of 16, with boxes.
 """
 
 from collections.abc import Collection
@@ -15,12 +15,12 @@ from splatctrl_cli.records import Box, Float32, Float64, Floats, Index, Label, S
 from splatctrl_cli.voxels import Balls
 
 _BITS = 10  # per coordinate of a Hilbert code
-_GROUPS = 8  # their number is a multiple of this
+_GROUPS = 8  # the number of groups is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spheres:
-    """N spheres, their centres as C clusters, relative to an anchor; radii (N,) [m].
+    """N spheres: centres in C clusters, relative to an anchor, and radii (N,) [m].
 
     anchor (3,) [m], world; source (16 C,): sphere of each entry; is_point (16 C,): 0 if spare.
     """
@@ -35,8 +35,8 @@ class Spheres:
     def of(cls, centers: ArrayLike, radii: ArrayLike, frame: Box | None = None) -> "Spheres":
         """Cluster centers (N, 3) [m], world, and radii (N,) [m], 0 allowed.
 
-        Anchor and curve follow `frame`, by default the centres' box. Raises NotEvaluableError without any, InputError
-        for a wrong shape, a non-finite value, or a negative radius.
+        Anchor and curve follow `frame`, by default the centres' box. Raises NotEvaluableError without centres,
+        InputError for a wrong shape, a non-finite value, or a negative radius.
         """
         points, radius_array = _check(centers, radii)
         lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
@@ -188,7 +188,10 @@ class ObstacleSpheres:
 def obstacle_spheres(
     splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
 ) -> ObstacleSpheres:
-    """Splats and balls with one of `labels`. Raises as `field_splats` without such balls."""
+    """Splats and balls with one of `labels`.
+
+    Raises NotEvaluableError without any, InputError for an unknown label.
+    """
     values = [int(label) for label in labels]
     is_chosen = np.isin(splats.labels, values)
     is_obstacle = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)

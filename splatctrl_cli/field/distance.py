@@ -73,7 +73,7 @@ class LogSumExpField(ABC):
         native.bake_kernel(self.spheres.clusters, self.terms(), span, distance, gradient, threads=threads)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """Distance and gradient as in `query_raw`, or the exact ones where undefined."""
+        """Distance and gradient as in `query_raw`, or of the exact field where undefined."""
         distance, gradient = self.query_raw(points)
         has_none = np.isnan(distance)
         if has_none.any():
@@ -85,9 +85,9 @@ class LogSumExpField(ABC):
 class GpdfField(LogSumExpField):
     """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
 
-    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, shifted by the largest exponent: finite for every l and
-    mix of radii. (Eq. 12 as printed overflows for r / l > 88 in float32.) It is undefined where weights of either
-    sign (cg) give no positive sum.
+    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, shifted by the largest exponent, is finite for every l and
+    mix of radii. (Eq. 12 as printed overflows for r / l > 88 in float32.) It is undefined where signed weights (cg)
+    give no positive sum.
     """
 
     is_matern = True
@@ -103,7 +103,7 @@ class GpdfField(LogSumExpField):
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """Distance (Q,) [m] and gradient (Q, 3) at points (Q, 3) [m]; NaN if undefined.
 
-        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this,
+        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|``, pi the terms' shares. Eq. 11 as printed is minus this gradient,
         normalised (`normalise`).
         """
         score, gradient = native.matern(
@@ -130,11 +130,11 @@ class GpdfField(LogSumExpField):
 
 
 class SeField(LogSumExpField):
-    """The paper's Gaussian kernel in the log domain, with radii: unbiased over a plane.
+    """The paper's Gaussian kernel in the log domain, with radii, unbiased over a plane.
 
     ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))``, pi the terms'
-    shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) Undefined where L >= 0, near and inside the
-    surface.
+    shares. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) It is undefined where L >= 0, near and inside
+    the surface.
     """
 
     is_matern = False
@@ -195,7 +195,7 @@ class SeField(LogSumExpField):
 
 
 class SafeField:
-    """The smaller of the exact distance and a kernel field, where that is defined.
+    """The smaller of the exact distance and a kernel field, where the latter is defined.
 
     Row-sum lumping over-estimates the clearance to a sparse object before a dense one.
     """
@@ -239,9 +239,9 @@ def march(
 ) -> tuple[Float64, Float64, Float64]:
     """Walk from points (Q, 3) [m], world, to the zero level of `field`.
 
-    Returns points reached (Q, 3) [m], the field there (Q,) [m], and length walked plus that (Q,) [m]. Each of the
-    `steps` goes against the gradient, by the field, at most the `exact` distance: it crosses no sphere. Points at or
-    behind the zero level, which Matern's field has before the spheres (`slabs.planar_zero_level`), stay. Raises
+    Returns points reached (Q, 3) [m], the field there (Q,) [m], and that field plus the length walked (Q,) [m]. Each
+    of the `steps` goes against the gradient, by the field but at most the `exact` distance, so it crosses no sphere.
+    Points at or behind the zero level stay; Matern's lies before the spheres (`slabs.planar_zero_level`). Raises
     UsageError for less than one step.
     """
     refuse_if(steps < 1, f"marching: expected at least 1 step, got {steps}", error=UsageError)
@@ -308,9 +308,9 @@ def device_field(
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedProbability:
-    """``Phi((mean - clearance) / sigma)``, with the field's measured error [m].
+    """``Phi((mean - clearance) / sigma)``, with the field's measured error.
 
-    mean: its average excess; sigma: the standard deviation.
+    mean, sigma [m]: average and standard deviation of the field's excess.
     """
 
     sigma: float
@@ -389,7 +389,7 @@ class PaperProbability:
         return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": fixed.VARIANCE_DIVISOR}
 
     def _combine(self, gpdf: Float64, half: Float64) -> Float64:
-        explained = np.exp(np.minimum(-half / self._half, 0.0))  # the sum never exceeds 1 but by rounding
+        explained = np.exp(np.minimum(-half / self._half, 0.0))  # the sum exceeds 1 only by rounding
         occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, fixed.CERTAIN_OCCUPANCY))
         return probability_of_occupancy(occupancy, explained)
 
@@ -397,7 +397,7 @@ class PaperProbability:
 def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
     """Eq. 14 of an occupancy o > 0 with variance ``(1 - explained) / 9``.
 
-    In logarithms. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
+    It is computed in logarithms. Far from splats it is ``Phi(-3) / Phi(0) = 0.0027``, not zero.
     """
     deviation = np.sqrt(np.maximum(1.0 - explained, fixed.LEAST_VARIANCE) / fixed.VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
@@ -412,6 +412,6 @@ PROBABILITIES: Mapping[str, _Make] = {  # by `config.probability`
 
 
 def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:
-    """Make all forms for these weights; the paper's variance does not hold for cg."""
+    """Make all forms for `config.weights`; the paper's variance does not hold for cg."""
     names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
     return {name: PROBABILITIES[name](spheres, config, threads) for name in names}

@@ -27,7 +27,7 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 
-RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
+RESOLUTION = 2e-6  # [m] float32 distances that differ by less are the same
 HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
 LOSS = 2.0 * HALF_DIAGONAL  # largest loss of the certified distance, in voxels
 
@@ -44,7 +44,7 @@ class GridLayout:
 
     @classmethod
     def over(cls, box: Box, voxel: float) -> "GridLayout":
-        """Cover a box with centres, from the lower corner on, two at least.
+        """Cover a box with cell centres from its lower corner, at least two per axis.
 
         Raises UsageError for a voxel or box without size.
         """
@@ -80,7 +80,7 @@ def bounding_box(splats: SplatSet, padding: float) -> Box:
 def check_loss(voxel: float, max_loss: float) -> None:
     """Raise UsageError if cells of `voxel` [m] may lose more than max_loss [m] of distance.
 
-    The certified distance loses at most a diagonal, ``sqrt(3) voxel``, interpolation half.
+    The certified distance loses at most a diagonal, ``sqrt(3) voxel``; interpolation loses half.
     """
     loss = LOSS * voxel
     if loss > max_loss:
@@ -137,7 +137,7 @@ def observed_planes(
 ) -> UInt8:
     """`VoxelState` (last - first, Y, Z) at centres of x-planes [first, last).
 
-    Never seen outside the occupancy grid, or without one.
+    Cells are never seen outside the occupancy grid, or without a grid.
     """
     observed = np.full((last - first, *layout.shape[1:]), VoxelState.NEVER_SEEN, dtype=np.uint8)
     if occupancy is None:
@@ -157,8 +157,8 @@ def observed_planes(
 class GridField:
     """Trilinear interpolation between cell centres.
 
-    Outside their box: the value at the box's nearest point minus the distance, a lower bound. Next to a NaN cell
-    (policy ``nan``), this and the certified distance are NaN.
+    Outside the box of centres: the value at its nearest point minus the distance to it, a lower bound. Next to a NaN
+    cell (policy ``nan``), it and `certified` are NaN.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
@@ -188,7 +188,7 @@ class GridField:
     def certified(self, points: Float64) -> Float64:
         """Lower bound (Q,) [m] of the exact distance to splats, not to objects.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. NaN where `query` is. Raises
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding. NaN where `query` gives NaN. Raises
         InputError without the channel bound.
         """
         bound = require(self._bound, "distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
@@ -203,7 +203,7 @@ class GridField:
 def exact_channel(grid: DistanceGrid) -> Float32:
     """Exact distance (X, Y, Z) [m]: the channel hard, or bound plus its margin.
 
-    Raises InputError without either.
+    Raises InputError without these channels.
     """
     if "hard" in grid.channels:
         return np.asarray(grid.channels["hard"], dtype=np.float32)
@@ -237,7 +237,8 @@ def blank(channels: Mapping[str, Values], is_unknown: Bool) -> Channels:
 class Cubes(Columns):
     """The never-seen cells (X, Y, Z) of a grid as solid cubes.
 
-    distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors of its growth.
+    distance: lower bound [m] of the signed distance from cell centres; away (..., 3): unit vectors along which it
+    grows.
     """
 
     is_unknown: Bool
@@ -248,8 +249,8 @@ class Cubes(Columns):
     def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
         """Bound the distances in a grid with known and unknown cells.
 
-        Outside: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance minus
-        half a cell. Inside: half a cell minus the distance to the nearest known centre.
+        Outside cubes: the larger of the nearest centre's distance minus half a diagonal, and the chessboard distance
+        minus half a cell. Inside: half a cell minus the distance to the nearest known centre.
         """
         indices = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
@@ -266,7 +267,7 @@ class Cubes(Columns):
         )
 
     def join(self, channels: Mapping[str, Values], bound_margin: float) -> tuple[Channels, int]:
-        """Channels of the nearer of field and cubes, and the number of changed cells."""
+        """Channels of field or cubes, whichever is nearer, and the number of changed cells."""
         joined = dict(channels)
         is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
         joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])

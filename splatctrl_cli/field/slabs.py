@@ -32,10 +32,10 @@ from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 
 def field_health(centers: Floats, radii: Floats, length: float, *, kernels: Collection[str]) -> dict[str, Any]:
-    """Ratios of splats (N, 3), (N,) [m] that decide a field's quality, with warnings, as in the header.
+    """Ratios of splats (N, 3), (N,) [m] that decide a field's quality, and warnings.
 
-    For kernels (se, gpdf) of this length scale [m]. spacing [m]: `median_spacing`; radius: median [m];
-    planar_zero_level [m]: of the kernel field.
+    kernels: se, gpdf; length [m]: their scale. spacing [m]: `median_spacing`. radius [m]: median. planar_zero_level
+    [m]: of the kernel field.
     """
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
@@ -175,14 +175,14 @@ def field_header(
     return header | ({"weights_solved": solved} if solved else {})
 
 
-SLAB_BYTES = 48 << 20  # per slab's channels, or one block's planes if larger
-_CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen one
+SLAB_BYTES = 48 << 20  # of a slab's channels; more if one block's planes need more
+_CUBES = 64  # bytes per cell of the whole grid, to find the nearest never-seen cell
 _CELL_BYTES = 64  # bytes per cell in a bake besides its channels, in at most 64 MiB or a block's planes
 
 
 @dataclass(frozen=True, kw_only=True)
 class EarlierBake:
-    """An earlier bake, valid where `mask` (blocks) is zero, with new observations."""
+    """An earlier bake, valid in blocks with `mask` 0, with new observations."""
 
     grid: DistanceGrid
     mask: UInt8
@@ -196,7 +196,7 @@ def bytes_per_cell(channels: Collection[str]) -> int:
 
 
 def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
-    """Yield the x-planes [first, last) of slabs from `begin` on, whole blocks."""
+    """Yield the x-planes [first, last) of slabs of whole blocks, from `begin` on."""
     per_plane = bytes_per_cell(channels) * layout.shape[1] * layout.shape[2]
     step = BLOCK * max(1, SLAB_BYTES // (BLOCK * per_plane))
     for first in range(begin, layout.shape[0], step):
@@ -271,7 +271,7 @@ class UnknownSpace:
 
 
 def bake_planes(baker: Baker, first: int, last: int, earlier: EarlierBake | None = None) -> Planes:
-    """Channels of x-planes [first, last), before `UnknownSpace`; `earlier` ones are copied."""
+    """Channels of x-planes [first, last), before `UnknownSpace`; channels of `earlier` are copied."""
     planes = baker.allocate(last - first)
     if earlier is None:
         baker.bake(first, last, planes)
@@ -300,7 +300,7 @@ def bake(
 
     channels: of `CHANNELS`, with sdf. Culling is exact for hard; with row sums, a kernel field is too large by at
     most ``config.truncation``. Bytes do not depend on threads. Raises UsageError for a bad or too large box,
-    NotEvaluableError without splats, InputError for non-finite ones.
+    NotEvaluableError without splats, InputError for non-finite splats.
     """
     chosen = field_splats(splats, labels)
     layout = GridLayout.over(box, config.voxel)
@@ -317,22 +317,22 @@ def bake(
     return DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=planes, header=header)
 
 
-BIN = 0.05  # bin k of the histogram is about k times this length
-NUM_BINS = 41  # about 0 to 2; the last one includes longer ones
+BIN = 0.05  # bin k of the histogram counts lengths about k times this
+NUM_BINS = 41  # lengths of about 0 to 2; the last bin also counts longer ones
 
 
 def grid_statistics(grid: DistanceGrid) -> dict[str, Any]:
-    """Statistics of a grid, as in ``field.json``; None or empty without channels for it.
+    """Statistics of a grid, as in ``field.json``; None or empty without their channel.
 
-    A few planes at a time: channels may be memory maps. num_blank: sdf NaN; num_inside: sdf <= 0; lowest, highest: of
-    sdf [m]; observed: cells by state; hard_share: of cells whose sdf is exact; never_seen_share: neither seen nor
-    swept. excess, by kernel field: count and share of cells where it exceeds the exact distance, and the largest [m].
+    num_blank: cells with sdf NaN. num_inside: cells with sdf <= 0. lowest, highest [m]: of sdf. observed: cells by
+    state. hard_share: of cells with exact sdf. never_seen_share: of cells neither seen nor swept. excess, by kernel
+    field: count and share of cells over the exact distance, and largest excess [m].
 
     gradient: its lengths, 1 for a distance (Eikonal equation). histogram: bin k counts lengths within half a
-    `bin_width` of k times that, the last also longer ones; share_near_one: within 0.05 of 1.
+    `bin_width` of k `bin_width`; the last bin also counts longer ones. share_near_one: within 0.05 of 1.
     """
     sums, most = dict[str, Any](), dict[str, float]()
-    for part in _parts(grid):
+    for part in _parts(grid):  # a few planes at a time: channels may be memory maps
         counted, largest = _measure(part)
         sums |= {name: value + sums.get(name, 0) for name, value in counted.items()}
         most |= {name: max(value, most.get(name, -np.inf)) for name, value in largest.items()}
@@ -366,7 +366,7 @@ def grid_statistics(grid: DistanceGrid) -> dict[str, Any]:
 
 
 def _measure(part: DistanceGrid) -> tuple[dict[str, Any], dict[str, float]]:
-    """Counts and sums of some planes, and their largest values; lowest: negative."""
+    """Counts and sums of some planes, and their largest values; lowest is negated."""
     channels, sdf = part.channels, np.asarray(part.channels["sdf"], np.float32)
     known = sdf[np.isfinite(sdf)]
     inside = int(np.count_nonzero(known <= 0))

@@ -34,8 +34,8 @@ MAX_BLOCKS = 2000
 def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Float64:
     """``sum_j k(|p_i - p_j|)`` (N,) of centres (N, 3) [m], j = i included, in linear time.
 
-    Each centre spreads one unit over eight nodes (trilinear), and reads their convolution. Its own term becomes k(0)
-    = 1. Convolving with ``2 k - (mean of k at the six neighbours)`` undoes the blur, h^2 / 3 per axis (h: node
+    Each centre spreads one unit over eight nodes (trilinear), and reads the convolution there. Its own term becomes
+    k(0) = 1. Convolving with ``2 k - (mean of k at the six neighbours)`` undoes the blur of h^2 / 3 per axis (h: node
     spacing), to second order. Raises UsageError for over `MAX_BLOCKS` blocks.
     """
     voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
@@ -64,7 +64,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
 
 def _blocks(cells: Index, reach: int) -> list[tuple[Index, Index, Index]]:
     """Each block's first node (3,), centres in reach, centres inside."""
-    inner = NODES - 2 * reach - 1  # cells whose nodes no mass from beyond the block reaches
+    inner = NODES - 2 * reach - 1  # cells that no mass from outside the block reaches
     blocks, which = np.unique(cells // inner, axis=0, return_inverse=True)
     order = np.argsort(which.ravel(), kind="stable")
     bounds = np.searchsorted(which.ravel()[order], np.arange(len(blocks) + 1))
@@ -136,11 +136,11 @@ def solve_process(
 ) -> tuple[Float64, Float64, int, float]:
     """``(K(P, P) + noise I)^-1 y`` (eq. 8, 12) for centres (N, 3) [m], y = exp(log_values) (N,).
 
-    It is ``scaled exp(log_scale)`` (N,); with the iterations, and the largest residual relative to its group's
-    largest y.
+    Returns scaled and log_scale (N,) of the solution ``scaled exp(log_scale)``, the iterations, and the largest
+    residual. Residuals are relative to their group's largest y.
 
-    The kernel is cut off at 8 l. Groups that it does not join are scaled by their largest y. Raises UsageError for
-    too little memory or too wide a spread of y, NotEvaluableError without convergence.
+    The kernel is cut off at 8 l. Each group of centres that it joins is scaled by the group's largest y. Raises
+    UsageError for too little memory or too wide a spread of y, NotEvaluableError without convergence.
     """
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)
@@ -252,8 +252,8 @@ NO_LOG = -1e4  # for a weight of zero: negligible, and finite
 class Weights:
     """w (N,) as ``sign exp(log_size)``: the occupancy is ``o(x) = sum_i w_i k_d(-r_i) k(x, p_i)``.
 
-    The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,) +-1, None if all positive;
-    num_iterations, residual: of a solver, None without one.
+    The Gaussian kernel has no ``k_d(-r_i)``: radii enter by the terms' shares. sign (N,): +-1, None if all are
+    positive. num_iterations, residual: None without a solver.
     """
 
     log_size: Float64

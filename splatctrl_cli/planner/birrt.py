@@ -29,7 +29,7 @@ class PlanOutcome(StrEnum):
 class Plan:
     """A search's result: waypoints (W, J) [rad] to goal number `goal`, none unless solved.
 
-    raw_path (V, J): path before shortening; num_checks: postures; search_time, shortcut_time [s]: wall clock.
+    raw_path (V, J): path before shortening; num_checks: postures checked; search_time, shortcut_time [s]: wall clock.
     """
 
     outcome: PlanOutcome
@@ -102,7 +102,7 @@ class _Search:
         return check.free_share
 
     def grown(self, tree: _Tree, targets: Float64) -> Index:
-        """Grow `tree` towards targets (K, J) by at most `reach`, where all is free."""
+        """Grow `tree` towards targets (K, J) by at most `reach`, where the edge is free."""
         near = tree.nearest(targets)
         way = targets - tree.q[near]
         way *= np.minimum(1.0, self.config.reach / np.maximum(np.linalg.norm(way, axis=1), 1e-12))[:, None]
@@ -177,7 +177,10 @@ def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerCo
 
 
 def check_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
-    """Start and goals (1 + G, J) within limits and free. Raises as `plan`."""
+    """Start and goals (1 + G, J) within limits and free.
+
+    Raises InputError outside the limits, NotEvaluableError in collision.
+    """
     model = clearance.model
     rows = [checked_posture(model, start, what="start")]
     several = np.atleast_2d(np.asarray(goals, dtype=np.float64))
@@ -205,9 +208,9 @@ def check_postures(clearance: Clearance, start: Float64, goals: Float64, config:
 def shorten_path(
     clearance: Clearance, waypoints: Float64, config: PlannerConfig, random: np.random.Generator
 ) -> tuple[Float64, int, int]:
-    """A path (W', J) of proved edges, not longer, and the checks made.
+    """Shortened path (W', J) of proved edges, and the numbers of edges and checks.
 
-    After the shortest way over waypoints, each round takes the free one of random shortcuts that saves most.
+    It starts with the shortest way over waypoints. Each round then takes the free random shortcut that saves most.
     """
     path, num_edges, num_checks = _skip_waypoints(clearance, waypoints, config)
     for _ in range(config.shortcut_rounds):

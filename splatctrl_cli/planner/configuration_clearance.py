@@ -35,8 +35,8 @@ class SolidScene(HasDistance, Protocol):
 class Clearance:
     """Signed distances of an arm's spheres to a scene and each other, less margins.
 
-    taken (R,) [m]: radii and margins; moving (M,) spheres; pairs (P, 2) of all spheres; levers (R, J): a motion dq
-    costs a row at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (else `lipschitz` scales its
+    taken (R,) [m]: radii plus margins. moving (M,), pairs (P, 2): indices of spheres. levers (R, J): a motion dq
+    lowers a row by at most ``levers @ |dq|`` [m], if the scene's distance is 1-Lipschitz (else `lipschitz` scales its
     rows). compiled: kernel for edges in a `SolidScene`, None without a chain.
     """
 
@@ -61,8 +61,8 @@ class Clearance:
     ) -> "Clearance":
         """An arm's clearance in a scene.
 
-        margin [m] to the scene (one number, or (S,) per sphere); self_margin [m] less the model's allowance. Raises
-        InputError if no sphere moves.
+        margin [m]: to the scene, one number or (S,). self_margin [m]: between spheres, less the model's allowance.
+        Raises InputError if no sphere moves.
         """
         moving = np.flatnonzero(model.moving_spheres)
         refuse_if(not len(moving), "robot: no collision sphere moves with a joint", remedy="check --spheres")
@@ -150,7 +150,7 @@ ROUNDING = 1e-9  # [m] subtracted from every clearance: far above rounding
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeCheck:
-    """Proofs of E edges: each is free to `free_share` (E,) of its length.
+    """Proofs of E edges: each is free up to a share `free_share` (E,) of its length.
 
     num_checks: postures checked.
     """
@@ -175,8 +175,8 @@ def check_edges(
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
-    Less than `contact` [m] counts as collision. Less than `give_up` [rad] before a collision stays unproved. With
-    `only_whole`, a collision sets an edge's free_share to 0.
+    Clearance below `contact` [m] counts as collision. The last `give_up` [rad] before a collision may stay unproved.
+    With `only_whole`, a collision sets an edge's free_share to 0.
     """
     if clearance.compiled is None or not isinstance(clearance.scene, SolidScene):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)
@@ -195,7 +195,7 @@ def check_edges(
 def check_sampled_edges(
     clearance: Clearance, start: Float64, end: Float64, *, contact: float, give_up: float, only_whole: bool
 ) -> EdgeCheck:
-    """Prove edges in any scene, by the clearance's postures; the kernel's oracle."""
+    """Prove edges in any scene by `Clearance.rows`; the kernel's oracle."""
     motion = end - start
     speeds = np.maximum(clearance.speeds(motion), STILL_ROW)
     length = np.linalg.norm(motion, axis=1)
@@ -214,7 +214,7 @@ def check_sampled_edges(
         low, high = np.concatenate([low, middle + covered]), np.concatenate([middle - covered, high])
         high = np.minimum(high, free[edge])
         is_open = low < high
-        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # remains before a collision
+        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # the part before a collision
         is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST_EDGE))
         np.minimum.at(free, edge[is_short], 0.0 if only_whole else low[is_short])
         keep = is_open & ~is_short & (low < free[edge])

@@ -1,4 +1,4 @@
-"""Timed paths for a replay's task, from start to goal in the scene known then.
+"""Timed paths for a replay's task, in the scene known at its start.
 
 G goal postures, K guesses, J joints.
 """
@@ -33,9 +33,9 @@ def resample(waypoints: Float64, spacing: float) -> Float64:
 def effector_rates(
     model: RobotModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
-    """Edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
+    """Greatest edge shares per second (W - 1,) within a frame's speeds [m/s], [rad/s].
 
-    Sampled `FRAME_SPACING` apart; infinite where an edge does not move it.
+    Edges are sampled `FRAME_SPACING` apart. Infinite where an edge does not move the frame.
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
@@ -50,9 +50,9 @@ def effector_rates(
 def time_path(
     waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
 ) -> TimedPath:
-    """Fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
+    """Fastest trapezoidal speeds within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
 
-    max_rate (W - 1,): limits edge shares per second. Raises InputError for fewer than two waypoints or limits not
+    max_rate (W - 1,): greatest edge shares per second. Raises InputError for fewer than two waypoints or limits not
     above zero.
     """
     refuse_if(len(waypoints) < 2, f"path: expected at least 2 waypoints, got {len(waypoints)}")
@@ -79,14 +79,14 @@ def time_path(
 NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
 
 Ending = Callable[[Clearance, Float64], Float64]
-"""A goal posture (J,) in an arm's room -> free postures (W, J) that lead to it."""
+"""Function of an arm's clearance and a goal posture (J,) that returns free postures (W, J) up to that goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedPath:
     """A timed path, or None with the reason in outcome.
 
-    margin, self_margin [m]: reduced where start or goal is nearer. seconds [s]: of planning.
+    margin, self_margin [m]: reduced if start or goal has less clearance. seconds [s]: of planning.
     """
 
     outcome: str
@@ -110,8 +110,8 @@ def planned_path(
 ) -> PlannedPath:
     """Plan a path from start to goal pose, within the controller's frame speeds.
 
-    scene: lower bound of a 1-Lipschitz distance. Goal postures start from home, start and random guesses. ending:
-    the path's last stretch.
+    scene: lower bound of a 1-Lipschitz distance. Goal postures are sought from home, start and random guesses.
+    ending: gives the end of the path.
     """
     began = time.perf_counter()
     start, frame = task.start, task.frame
@@ -165,7 +165,7 @@ def _find(
 
 
 def path_to_nearest(room: Clearance, start: Float64, goals: Float64, planner: PlannerConfig) -> Plan:
-    """A path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any."""
+    """A path to the nearest goal (G, J) within `NEAREST_ITERATIONS`, else to any goal."""
     nearest = goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
     few = replace(planner, max_iterations=min(fixed.NEAREST_ITERATIONS, planner.max_iterations))
     nearest_plan = plan(room, start, nearest[:1], few, seed=planner.seed)
@@ -179,7 +179,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
     margin, self_margin = min(control.margin, float(scene[0])), min(control.self_margin, float(own[0]))
     short = np.maximum(margin - scene[1:], self_margin - own[1:])
-    if np.min(short) > 0:  # no goal keeps the start's margins: use those of the best goal
+    if np.min(short) > 0:  # no goal has the start's margins: use the best goal's
         best = int(np.argmin(short))
         margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
@@ -210,7 +210,7 @@ def goal_postures(
 ) -> Float64:
     """Distinct postures (G, J) within limits that bring `frame` to a pose.
 
-    They meet a tenth of the goal's tolerances, in guess order; G is at most `at_most`, perhaps 0.
+    They meet a tenth of the goal's tolerances, in order of the guesses. G is 0 to `at_most`.
     """
     postures: list[Float64] = []
     for guess in guesses:

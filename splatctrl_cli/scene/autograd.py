@@ -19,10 +19,10 @@ def rasterise(
     *,
     threads: int = 0,
 ) -> torch.Tensor:
-    """Planes (5, H, W), as in `kernels.raster` (eq. 1 to 3), differentiable.
+    """Differentiable planes (5, H, W): colour, depth and opacity (eq. 1 to 3).
 
     camera (18,): `scene.render.camera_array`; centers (N, 3) [m], world; radii (N,) [m]; opacities (N,); colors (N,
-    3); float32 on the CPU.
+    3); all float32 on the CPU.
     """
     planes: torch.Tensor = _Rasterise.apply(  # type: ignore[no-untyped-call]
         camera, centers, radii, opacities, colors, threads

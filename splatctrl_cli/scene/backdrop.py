@@ -1,6 +1,6 @@
 """Splats for rendering only: the backdrop and the shell.
 
-The backdrop fills pixels without depth. The shell lies beyond the workspace, coarse, with its own budget.
+The backdrop fills pixels without depth. The coarse shell lies beyond the workspace, with its own budget.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,20 +28,20 @@ from splatctrl_cli.scene.seeding import (
     thinning,
 )
 
-COLUMNS = (60, 48, 40, 32, 26, 22, 18, 15)  # cells across an image: the first for which seeds are few enough
+COLUMNS = (60, 48, 40, 32, 26, 22, 18, 15)  # cells across an image; the first number with few enough seeds is used
 BLOCKS = (4, 2, 1)  # cells along the side of a seed's square, if its colours are alike
 RADIUS = 0.6  # of a seed, in sides of its square
-DEPTHS = (0.5, 10.0)  # times the median depth, between which seeds are placed
-NUM_DEPTHS = 40  # evenly in inverse depth
+DEPTHS = (0.5, 10.0)  # nearest and farthest depth of seeds, by the median depth
+NUM_DEPTHS = 40  # at equal steps of inverse depth
 ASKED_VIEWS = 16  # views that compare their colour with a seed's
 SAME_COLOR, OTHER_COLOR = 0.03, 0.1  # mean difference of channels in [0, 1]
-NEAR_DEPTH = 0.03  # share of a measured depth, before or behind which a seed is off that surface
-LEAST_VOTES = 1.0  # one full vote: a near place needs two views
+NEAR_DEPTH = 0.03  # share of a measured depth; a seed further before or behind it is off that surface
+LEAST_VOTES = 1.0  # one full vote, which a place must exceed: it needs two views
 BLANK = 0.02  # share of a cell's pixels with depth
 
 
 def backdrop_seeds(frames: Sequence[RgbdFrame], opacities: Sequence[Float32], background: Color, most: int) -> Seeds:
-    """Place `most` seeds or fewer at pixels without depth that map and background leave unexplained.
+    """Place at most `most` seeds at pixels without depth, unexplained by map and background.
 
     opacities: rendered (H, W). Cells of pixels become larger until the seeds are few enough.
     """
@@ -80,7 +80,7 @@ def _seeds_of(
             votes += counts * (1 - difference / OTHER_COLOR)
     by_depth = votes.reshape(len(v), -1)
     is_agreed = by_depth.max(axis=1) > LEAST_VOTES
-    best = np.where(is_agreed, np.argmax(by_depth, axis=1), 0)  # the farthest of the best
+    best = np.where(is_agreed, np.argmax(by_depth, axis=1), 0)  # the farthest of equally good depths
     return Seeds(
         centers=points.reshape(*by_depth.shape, 3)[np.arange(len(v)), best].astype(np.float32),
         radii=(RADIUS * size * depths[best] / k.fx).astype(np.float32),
@@ -105,7 +105,7 @@ class _Cells:
         return np.asarray(cut.reshape(h, self.side, w, self.side, *image.shape[2:]).mean(axis=(1, 3)), np.float64)
 
     def missing_squares(self, is_missing: Bool) -> Iterator[tuple[Float64, Float64, Float64, Float32]]:
-        """Middles v, u [px] (K,), sides [px] (K,) and colours (K, 3) of squares of missing cells alike in colour."""
+        """Yield squares of missing cells with similar colours: middles v, u, sides [px] (K,), colours (K, 3)."""
         for block in BLOCKS:
             h, w = (size // block for size in is_missing.shape)
             part = np.s_[: h * block, : w * block]
@@ -142,7 +142,7 @@ class _Cells:
         return is_covered
 
     def compare(self, points: Float64, colors: Float32) -> tuple[Float64, Bool]:
-        """Colour differences (K,) to points (K, 3), 1 before depth, and False behind it or out of view."""
+        """Colour differences (K,) to points (K, 3), 1 before depth; False (K,) behind depth or out of view."""
         u, v, z = self._locate(points)
         h, w = self.depth.shape
         is_in = (z > 0) & (u > -0.5) & (v > -0.5) & (u < w - 0.5) & (v < h - 0.5)
@@ -158,7 +158,7 @@ Masked = Sequence[tuple[View, Bool]]
 
 
 def pixels_beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
-    """Valid pixels (H, W) with depth of at least `min_range` [m] outside the workspace, except `mounted` ones."""
+    """Valid pixels (H, W) outside the workspace with depth of at least `min_range` [m], except `mounted` pixels."""
     depth = view.target.depth
     left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0) & view.frame.is_in_view
     return np.asarray(left_out if mounted is None else left_out & ~mounted)
@@ -167,7 +167,7 @@ def pixels_beyond(view: View, min_range: float, mounted: Bool | None = None) -> 
 class Shell:
     """Extra splats, a share `scene.shell` of `scene.max_splats`, for what views show beyond the workspace.
 
-    Lengths scale by the median depth of the first such pixels.
+    Lengths scale by the median depth beyond the workspace.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class Shell:
         return self.buffer.splats(self._num_threads)
 
     def _add(self, shown: Masked) -> None:
-        """Seed what the shell does not explain; restart coarser if too many are unmet."""
+        """Seed unexplained pixels; restart with a new density if too many seeds are unmet."""
         unexplained = [
             (view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown
         ]

@@ -1,4 +1,4 @@
-"""A fixed budget of splat slots; dead ones stay, transparent, until reused."""
+"""A fixed budget of splat slots; dead slots stay transparent until reused."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ from splatctrl_cli.records import (
     Values,
 )
 
-BACKDROP = 0b11  # beside the labels: a slot that is rendered only
+BACKDROP = 0b11  # one more label: a slot that is only rendered
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 
@@ -28,7 +28,7 @@ CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 class Seeds(Columns):
     """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1].
 
-    Candidates for them have the size D/f [m] of their pixels as radii.
+    A candidate's radius is its pixel's size D/f [m].
     """
 
     centers: Float32
@@ -113,9 +113,9 @@ class SplatBuffer:
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 
     def copy(self, sources: Index, opacities: Float64, radii: Float64) -> int:
-        """Copy slots `sources` (K,), with repetitions, into available dead slots; return how many.
+        """Copy slots `sources` (K,), with repetitions, into available dead slots; return their number.
 
-        opacities (M,), radii (M,) [m]: of sources and copies. Labels are copied; moments restart.
+        opacities (M,), radii (M,) [m]: new ones of sources and copies. Labels are copied; moments restart.
         """
         slots = np.flatnonzero(~self.is_alive)[: len(sources)]
         sources = sources[: len(slots)]

@@ -1,4 +1,4 @@
-"""The whole state of a fitter as arrays, to continue with the same bytes."""
+"""State of a fitter as arrays, to continue with the same bytes."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -26,7 +26,7 @@ FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
 
 
 def fitter_state(fitter: SceneFitter) -> dict[str, Values]:
-    """Splats, moments, occupancy, frames and counters: views, not copies."""
+    """Splats, moments, occupancy, frames and counters, not copied."""
     arrays: dict[str, Values] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
@@ -59,7 +59,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, Values]:
 
 
 def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
-    """Restore the state of a fitter with the same configuration, seed and workspace."""
+    """Restore a fitter's state, of the same configuration, seed and workspace."""
     for name, array in fitter.buffer.arrays().items():
         array[...] = arrays[name]
     for name in GRID_NAMES:

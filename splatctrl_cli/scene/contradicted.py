@@ -1,7 +1,7 @@
 """Evidence of a time step: masks of its frames, and rays that another frame contradicts.
 
-Rays go through a surface that another camera measures if an object is shiny or dark: its depth is far too large, or
-missing.
+The depth of a shiny or dark object may be far too large, or missing. Its rays then go through a surface that another
+camera measures.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,10 +46,10 @@ ALONG = np.array([[1.0, -2.0, 1.0]], np.float32)  # twice the deviation from the
 
 @dataclass(frozen=True, kw_only=True)
 class Contradicted:
-    """Blocks of `side` pixels (h, w) of a frame that another frame contradicts.
+    """Blocks (h, w) of a frame, `side` pixels wide, that another frame contradicts.
 
-    until (h, w) [m]: depth where a block's rays cross another frame's surface, 0 = nowhere; is_blank (h, w): no
-    depth; through (h, w) [m]: depth of the block's surface where another frame's rays cross it, 0 = nowhere.
+    until (h, w) [m]: depth where a block's rays cross another frame's surface, 0 = nowhere. is_blank (h, w): True
+    without depth. through (h, w) [m]: depth of the block's surface where another frame's rays cross it, 0 = nowhere.
     """
 
     side: int
@@ -58,18 +58,21 @@ class Contradicted:
     through: Float32
 
     def pixels(self, shape: tuple[int, ...]) -> Bool:
-        """Pixels (H, W) whose depth lies on no surface, as their rays cross another frame's."""
+        """Pixels (H, W) whose depth lies on no surface, because their rays cross another frame's surface."""
         return self._spread((self.until > 0) & ~self.is_blank, shape)
 
     def unproven(self, frame: RgbdFrame) -> RgbdFrame:
-        """Frame without the depth that rays of another frame cross: it proves no space free."""
+        """Frame without depth of surfaces that another frame's rays cross.
+
+        Such depth proves no space free.
+        """
         is_through = self._spread(self.through > 0, frame.depth.shape)
         return replace(frame, depth=np.where(is_through, np.float32(0.0), frame.depth)) if is_through.any() else frame
 
     def points(self, frame: RgbdFrame, config: OccupancyConfig, *, is_blank: bool) -> Iterator[Float64]:
-        """`points_on_rays` of its blocks up to `until` or `through`.
+        """`points_on_rays` of the blocks, up to the larger of `until` and `through`.
 
-        is_blank: from blocks without depth, or with it.
+        is_blank: of blocks without depth, else with depth.
         """
         end = np.maximum(self.until, self.through)
         v, u = np.nonzero((end > 0) & (self.is_blank == is_blank))
@@ -83,12 +86,12 @@ class Contradicted:
 
 
 def find_contradicted(seen: Seen, *, is_drawn: bool, each: Each = map) -> Iterator[Contradicted]:
-    """Yield what other frames or the drawn robot contradict in each frame of a step.
+    """Yield the blocks of each frame that other frames or the drawn robot contradict.
 
     All rays of a contradicted block and its neighbours cross another frame's surface. They end over `CONTRADICTED`
-    [m] behind it, or have no return, in range and outside stereo shadows. Blocks of the drawn robot without return
-    count, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. `SEEN_THROUGH_PIXELS` adjacent blocks
-    that others' rays cross prove no space free. each: a `map` over frames.
+    [m] behind that surface, or have no return, in range and outside stereo shadows. Blocks of the drawn robot without
+    return count, too. Fewer than `CONTRADICTING_PIXELS` adjacent blocks are noise. At least `SEEN_THROUGH_PIXELS`
+    adjacent blocks that another frame's rays cross prove no space free. each: a `map` over frames.
     """
     views = list(each(_BlockView.of, *zip(*seen, strict=True)))
     through = [np.zeros_like(view.surely) for view in views]
@@ -143,7 +146,7 @@ def take_in_evidence(
 ) -> None:
     """Add a step's depth, reasons of unseen voxels, lost edges and robot to the occupancy.
 
-    last: by camera, its last frame and mask.
+    last: each camera's last frame and mask.
     """
     config = occupancy.config
     proving = [
@@ -192,11 +195,11 @@ def _is_plane(depth: Float32) -> Bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _BlockView:
-    """A frame in blocks of `side` pixels (h, w): its rays, and the surface that they hit.
+    """A frame in blocks (h, w), `side` pixels wide: its rays, and the surface that they hit.
 
-    surely (h, w) [m]: depth that all rays of a block and its neighbours reach; farthest (h, w) [m]: of a block;
-    is_lost (h, w): all these rays unexpectedly return none. points (K, 3) [m], world: of objects away from depth
-    edges, with block indices (K,), depth (K,) [m].
+    surely (h, w) [m]: depth that all rays of a block and its neighbours reach. farthest (h, w) [m]: greatest depth of
+    a block. is_lost (h, w): all these rays unexpectedly have no return. points (K, 3) [m], world: of objects, away
+    from depth edges, with block indices (K,) and depth (K,) [m].
     """
 
     frame: RgbdFrame
@@ -237,9 +240,9 @@ class _BlockView:
         )
 
     def run_through(self, surface: "_BlockView", until: Float32) -> Index:
-        """Write the depth of crossed surface points into `until` (h, w).
+        """Write the depth of surface points that rays cross into `until` (h, w).
 
-        Return indices of points behind which a ray measures depth.
+        Return indices of the points behind which rays measure depth.
         """
         pixel, z = pixels_at(self.frame, surface.points)
         width = self.frame.intrinsics.width

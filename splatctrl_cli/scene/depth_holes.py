@@ -1,7 +1,7 @@
 """Holes without depth, which may contain dark, shiny or clear objects.
 
-An object in a hole is on its rays, until other rays clear them. At depth edges without depth, the nearer surface may
-extend.
+An object may be anywhere on a hole's rays, until other rays clear the space. At edges without depth, the nearer
+surface may extend further.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, is_mixed, pixels_
 from splatctrl_cli.voxels import LostEdges, Unseen
 
 NEIGHBOURS = np.ones((3, 3), np.uint8)  # a pixel and its neighbours
-ROBOT_OUTLINE = np.ones((9, 9), np.uint8)  # its outline is fattened, too
+ROBOT_OUTLINE = np.ones((9, 9), np.uint8)  # pixels; the robot's outline is fattened, too
 MOST_POINTS = 1 << 18  # per batch: fine voxels and a large hole may need a hundred million
 
 
@@ -32,7 +32,7 @@ def unanswered_points(
     """Yield points (K, 3) [m], world, half a voxel apart on rays of holes.
 
     Rays about a voxel apart end at the depth of the nearest pixel with depth. Holes up to `NARROW_HOLE` voxels wide
-    do not count, nor new ones of a still camera. robot_depth (H, W) [m]: rendered, 0 = none; before: the camera's
+    do not count, nor new holes of a still camera. robot_depth (H, W) [m]: rendered, 0 = none. before: the camera's
     last frame and its mask (only kinds, if resumed).
     """
     holes = _holes(frame, robot_depth > 0)
@@ -53,7 +53,7 @@ def unanswered_points(
 
 
 def _holes(frame: RgbdFrame, is_robot: Bool) -> Bool:
-    """Pixels (H, W) in groups without depth.
+    """Pixels (H, W) of groups without depth.
 
     No group meets the border, the robot or its stereo shadow.
     """
@@ -81,7 +81,7 @@ def _add_shadow(is_robot: Bool, is_shadow: Bool) -> Bool:
 def points_on_rays(frame: RgbdFrame, v: Index, u: Index, end: Float32, config: OccupancyConfig) -> Iterator[Float64]:
     """Yield points (K, 3) [m], world, half a voxel apart on rays up to `end` (N,) [m].
 
-    Rays begin at `min_range`; v, u (N,): their pixels.
+    Rays begin at `min_range`. v, u (N,): pixels of the rays.
     """
     depths = np.arange(config.min_range, end.max(initial=config.min_range), 0.5 * config.voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))
@@ -100,7 +100,7 @@ def _nearest_depth(depth: Float32) -> Float32:
     return np.asarray(of_label[which])
 
 
-NEAR_ROBOT = np.ones((5, 5), np.uint8)  # its own outline loses depth, too
+NEAR_ROBOT = np.ones((5, 5), np.uint8)  # pixels; the robot's own outline loses depth, too
 
 
 def lost_edges(
@@ -108,9 +108,9 @@ def lost_edges(
 ) -> dict[str, LostEdges]:
     """Return, by camera, a ball for each pixel without depth next to an object pixel.
 
-    Its depth is that of the nearest object next to it, its radius one pixel. Lone object pixels, and depths between
-    two surfaces, do not count. Balls that a frame sees through by `see_through`, or that are as near to the robot,
-    are left out.
+    A ball has the depth of the nearest object next to it, and a radius of one pixel. Lone object pixels, and depths
+    between two surfaces, do not count. Balls that a frame sees through by `see_through`, or within `see_through` of
+    the robot, are left out.
     """
     cameras = [camera_array(frame.intrinsics, frame.T_world_camera) for frame, _ in seen]
     surely = [cv2.erode(frame.depth, NEIGHBOURS) for frame, _ in seen]  # 0 next to lost pixels: sees through nothing
@@ -159,7 +159,7 @@ def find_shadows(depth: Float32, focal: float) -> Bool:
 
 
 def _baseline(height: Float32, lost: Int32) -> float:
-    """Baseline [m] of shadows, the median over higher depth steps (K,); 0 without any."""
+    """Baseline [m] of shadows: median over the higher depth steps (K,); 0 without steps."""
     if not len(height):
         return 0.0
     higher = height >= _median(height, height)
@@ -182,7 +182,7 @@ def _behind(depth: Float32) -> Float32:
     return np.asarray(of_group[group])
 
 
-OUTLINE = np.ones((5, 5), np.uint8)  # the robot's outline loses depth, too
+OUTLINE = np.ones((5, 5), np.uint8)  # pixels; the robot's outline loses depth, too
 
 
 def explain_unseen(occupancy: OccupancyMap, seen: Seen, robot: RobotPosture, each: Each = map) -> None:

@@ -28,7 +28,7 @@ class Descent:
     """Optimiser of a buffer's M splats, with noise drawn from seed and iteration.
 
     background: colour behind the splats, None until chosen. heard: called after each iteration. device: computes
-    `run` and `rendering`, or raises DeviceError; None: the processor.
+    `run` and `rendering`, or raises DeviceError; None: the processor computes them.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Descent:
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
     def run(self, views: Sequence[View], settings: OptimiserSettings, depth: float = 1.0) -> dict[int, LossTerms]:
-        """Run an iteration on each view; return their last losses, by id.
+        """Run an iteration on each view; return each view's last losses, by its id.
 
         depth: factor of the depth loss.
         """
@@ -108,7 +108,7 @@ class Descent:
         return self._loss.evaluate(self.planes(view), view.target, weights, empty_planes(*view.target.depth.shape))
 
     def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
-        """Learning rates times `rate`, of centre and radius times `geometry`."""
+        """Settings with rates of centre and radius times `geometry`, other rates and noise times `rate`."""
         c = self._config
         return OptimiserSettings(
             lr_center=c.lr_center * geometry,
@@ -124,9 +124,9 @@ class Descent:
         )
 
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
-        """Colour error of each view where mappable, and summed blended opacity of each slot (M,).
+        """Colour error of each view where mappable, and each slot's summed blended opacity (M,).
 
-        The derivative of a summed colour plane by a splat's colour is that sum.
+        This sum is the derivative of a summed colour plane by a splat's colour.
         """
         background = np.array(self.background, np.float32)[:, None, None]
         misfits: list[Misfit] = []

@@ -122,11 +122,11 @@ class SceneFitter:
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
         as_they_were = self.buffer.parameters.copy()
         terms = self.descent.run(self.window.schedule(num_iterations, rng), self.descent.settings())
-        hidden = np.union1d(hidden, hidden_objects(self.buffer, robot, seen, self.occupancy.config))  # drifted there
+        hidden = np.union1d(hidden, hidden_objects(self.buffer, robot, seen, self.occupancy.config))  # moved there
         self.buffer.parameters[hidden] = as_they_were[hidden]
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen, steady)
-        is_lasting = None  # of the first frames nothing lasts yet
+        is_lasting = None  # in the first step, nothing has lasted yet
         if self.num_steps and robot is not None:
             lasting = [object_twice(f, before.get(f.camera), each) for f, each in zip(frames, steady, strict=True)]
             is_lasting = partial(lasts_at_fixed_links, robot, frames, lasting, config)
@@ -147,7 +147,7 @@ class SceneFitter:
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
-        """Optimise a static scene over the window, with rates that fall to `final_rate`.
+        """Optimise a static scene over the window, with rates that fall to a share `final_rate`.
 
         `progress` gets the iterations after each of ten blocks; a restored fitter continues with the next.
         """
@@ -238,7 +238,7 @@ class SceneFitter:
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
     def _behind(self, views: Sequence[View]) -> Color:
-        """Background: colour of pixels without depth, or without splats if no view has depth."""
+        """Background: colour of pixels without depth; of pixels without splats if no view has depth."""
         if self.config.background == "black":
             return BLACK
         counted = [view.target.counted > 0 for view in views]
@@ -265,7 +265,7 @@ class SceneFitter:
         return relabel(self.buffer, self.occupancy, robot, seen, 0.5 * self.config.contact_radius)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
-        """Remove splats moved off the robot, into air or out, or made faint; count them."""
+        """Remove and count splats that left the robot or the workspace, float, strayed or faded."""
         buffer = self.buffer
         removed["robot"] += buffer.kill(self._relabel(robot, seen))
         removed["seen_through"] += buffer.kill(self._floating(views))
@@ -274,7 +274,7 @@ class SceneFitter:
         removed["opacity"] += buffer.kill(buffer.is_alive & (buffer.opacities < self.config.min_opacity))
 
     def _strayed(self, robot: RobotPosture | None, seen: Seen) -> Bool:
-        """Object splats (M,) away from the robot, in no pixel, in space never seen."""
+        """Object splats (M,) away from the robot that no pixel shows, in never-seen space."""
         is_strayed = np.zeros(len(self.buffer.centers), bool)
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config, np.inf)
         hidden = hidden[~self.occupancy.occupancy_around(self.buffer.centers[hidden])[1]]
@@ -295,7 +295,7 @@ class SceneFitter:
         return {reason: self.buffer.kill(mask) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
-        """Fill dead slots at M_add's pixels; the first full view sets the density."""
+        """Fill dead slots at M_add's pixels; the first candidates set the density."""
         by_label: dict[Label, list[Seeds]] = {Label.OBJECT: [], Label.ROBOT: []}
         shown = [self.descent.rendering(view) for view in views]
         added = list(self._each(lambda v, its: add_mask(v.frame, its, v.mappable, self.config), views, shown))
@@ -352,7 +352,7 @@ class SceneFitter:
         """Add splats where measured surfaces are far from all spheres, in alternate halves per step.
 
         Surfaces in space that was free come first. For missing slots, splats are evicted and counted in `removed`: at
-        once for those, else every EVICT_EVERY steps.
+        once for these surfaces, for others every EVICT_EVERY steps.
         """
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
@@ -391,7 +391,7 @@ class SceneFitter:
     def _show_contact(
         self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, steady: Sequence[Bool]
     ) -> Filled:
-        """Give objects near moving links splats of half `contact_radius`, at most that radius apart."""
+        """Give objects near moving links splats of half `contact_radius`, at most `contact_radius` apart."""
         if robot is None:
             return Filled()
         radius, is_object = 0.5 * self.config.contact_radius, self._standing_for(Label.OBJECT)
@@ -403,14 +403,15 @@ class SceneFitter:
         seeds = contact_seeds(
             seen, mappable, robot, splats, self.config, num_threads=self.num_threads, each=self._each
         )
-        least = max((mask.reach for _, mask in seen), default=0.0)  # noise of depth: within it, no view sees through
+        least = max((mask.reach for _, mask in seen), default=0.0)  # noise of depth: less is not seen through
         seeds = seeds.select(self._is_grounded(seeds.centers, views, least=least))
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _keep_to_surface(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> None:
         """Put object splats on measured depth, and shrink those that protrude before it.
 
-        Near the robot the limit is the depth's error, elsewhere `FAR_PROTRUSION` while slots are left for the gaps.
+        Near the robot the limit is the depth's error. Elsewhere it is `FAR_PROTRUSION`, while slots are left for the
+        gaps.
         """
         if robot is None:
             return
@@ -436,7 +437,7 @@ class SceneFitter:
     def _is_grounded(
         self, points: Float32, views: Sequence[View], label: int = Label.OBJECT, *, least: float = np.inf
     ) -> Bool:
-        """Points (K,) that no view sees through by the smaller of `see_through` and `least` [m].
+        """True (K,) for points that no view sees through by the smaller of `see_through` and `least` [m].
 
         least 0 counts as unlimited.
         """

@@ -15,14 +15,14 @@ from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.self_mask import least_within, pixels_at
 
 _STEPS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float32) - 1
-DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), of the points of a sphere's edge
+DIRECTIONS = _STEPS / np.linalg.norm(_STEPS, axis=1, keepdims=True)  # (26, 3), to points of a sphere's edge
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame for the optimiser, with its `nearest_depth` (H, W) [m].
+    """A frame for the optimiser.
 
-    nearest_object: the same, with robot pixels counted apart.
+    nearest, nearest_object: its `nearest_depth` (H, W) [m], with and without the robot.
     """
 
     frame: RgbdFrame
@@ -71,9 +71,9 @@ def make_view(
 def seen_through(
     centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1, label: int = Label.OBJECT
 ) -> Bool:
-    """Splats (N,) that float: nearer than every valid depth around their pixel in some view.
+    """True (N,) for splats that float: some view measures only farther depth around their pixel.
 
-    "Around" is as in `nearest_depth`, "nearer" by more than `tolerance` [m]. label: of the splats.
+    "Farther" is by over `tolerance` [m]. The depth is `View.nearest` for the label ROBOT, else `View.nearest_object`.
     """
     cameras = [view.camera for view in views]
     nearest = [view.nearest if label == Label.ROBOT else view.nearest_object for view in views]
@@ -81,10 +81,10 @@ def seen_through(
 
 
 def move_to_surface(centers: Float32, views: Sequence[View], most: float) -> Float32:
-    """Move centres (N, 3) [m], world, floating up to `most` [m], onto the measured surface.
+    """Move centres (N, 3) [m], world, that float by up to `most` [m], onto the measured surface.
 
-    A centre floats if all views that see it measure more depth at and around its pixel. It moves to the least of
-    these depths, along the ray with the smallest step. Views with depth over `most` before it do not count.
+    A centre floats if all views that see it measure more depth at and around its pixel. It moves along the ray of the
+    view with the smallest step to that depth. Views that measure depth over `most` before the centre do not count.
     """
     least, towards = np.full(len(centers), np.inf, np.float32), np.zeros_like(centers)
     for view in views:
@@ -102,10 +102,9 @@ def move_to_surface(centers: Float32, views: Sequence[View], most: float) -> Flo
 def shrink_radii(
     centers: Float32, radii: Float32, views: Sequence[View], tolerance: float, least: float, num_threads: int = 1
 ) -> Float32:
-    """Radii (N,) [m] that keep spheres within measured depth, `least` [m] or more.
+    """Radii (N,) [m], shrunk to `least` [m] or more, of spheres behind measured depth.
 
-    A sphere shrinks while, in some view, its edge floats by over `tolerance` [m] before depth around, or its nearest
-    point before its pixel's depth.
+    A sphere shrinks while a view sees through its edge, or its point nearest to the camera, by over `tolerance` [m].
     """
     cameras = [view.camera for view in views]
     depths = [np.where(view.frame.depth > 0, view.frame.depth, np.float32(np.inf)) for view in views]
@@ -120,7 +119,7 @@ def shrink_radii(
         edge = np.ascontiguousarray(edge.reshape(-1, 3))
         floats = points.seen_through(edge, cameras, nearest, tolerance, num_threads).reshape(len(left), -1)
         is_out = floats.any(axis=1)
-        for number, camera in enumerate(cameras):  # its own pixel shows what is before a centre
+        for number, camera in enumerate(cameras):  # by the depth of the point's own pixel
             before = np.ascontiguousarray(centers[left] + shrunk[left, None] * towards[left, number])
             is_out |= points.seen_through(before, [camera], [depths[number]], tolerance, num_threads)
         left = left[is_out & (shrunk[left] > least)]
@@ -129,7 +128,7 @@ def shrink_radii(
 
 
 class Window:
-    """Newest views and up to `config.window` keyframes; the oldest drop first."""
+    """Newest views and up to `config.window` keyframes; the oldest keyframes drop first."""
 
     def __init__(self, config: SceneConfig) -> None:
         self.config = config
@@ -137,7 +136,7 @@ class Window:
         self.keyframes: list[View] = []
 
     def advance(self, views: Sequence[View]) -> None:
-        """Make `views` the newest; replaced ones of moved cameras become keyframes."""
+        """Make `views` the newest; replaced views of moved cameras become keyframes."""
         fresh = {view.frame.camera for view in views}
         for old in self.newest:
             if old.frame.camera not in fresh:
@@ -153,7 +152,7 @@ class Window:
         return metres > self.config.keyframe_distance or degrees > self.config.keyframe_angle
 
     def schedule(self, num_iterations: int, rng: np.random.Generator) -> list[View]:
-        """View of each iteration: shuffled rounds of newest views and at most as many keyframes."""
+        """Views by iteration: shuffled rounds of newest views and at most equally many keyframes."""
         views: list[View] = []
         while len(views) < num_iterations:
             count = min(len(self.keyframes), max(len(self.newest), 1))

@@ -1,6 +1,6 @@
 """Labels of splats, trails of the robot and people (III-C), and objects near the robot.
 
-Views of objects near the robot are poorest, and their distances matter most.
+Objects near the robot are seen worst, and their distances matter most.
 """
 
 from collections.abc import Sequence
@@ -60,8 +60,9 @@ def relabel(
 def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
     """Splats (M,) of the robot, and those that a pixel shows to be an object.
 
-    The pixel whose depth a splat explains best decides. Hidden splats keep their label; the robot's must be within
-    `see_through` of its body. Others well inside the body become robot (in solid voxels, if all is drawn).
+    The pixel with depth nearest to the splat decides. Hidden splats keep their label; robot splats only within
+    `see_through` of the body. Other hidden splats well inside the body become robot (in solid voxels, only if all is
+    drawn).
     """
     alive, config = buffer.is_alive, occupancy.config
     kind = shown_kinds(buffer.centers, seen, config)
@@ -79,8 +80,8 @@ def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPostu
 def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
     """`PixelKind` (N,) of the pixel with depth nearest to centers (N, 3) [m], world.
 
-    OBJECT within `see_through`, unless nearer to the rendered robot; ROBOT within its tolerance, not behind it; else
-    NOTHING.
+    OBJECT: its depth is within `see_through`, and the rendered robot is no nearer. ROBOT: its depth is within
+    tolerance. NOTHING: neither.
     """
     best = np.full(len(centers), np.inf, np.float32)
     kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
@@ -101,7 +102,7 @@ def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
     """Splats (M,) in voxels that human pixels hit.
 
-    They stay human while one of the eight nearest voxels is.
+    Human splats stay human while one of the eight nearest voxels is.
     """
     is_in = occupancy.entity_at(buffer.centers) & Label.HUMAN > 0
     was_human = buffer.is_alive & (buffer.labels == Label.HUMAN)
@@ -127,9 +128,9 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
 def count_carried(
     declared: Declarations, frame: RgbdFrame, mask: SelfMask, robot: RobotPosture, bare: RobotSurface, time_s: float
 ) -> None:
-    """Count declared boxes that explain robot pixels, where the `bare` surface does not.
+    """Count declared boxes that explain robot pixels which the `bare` surface does not explain.
 
-    bare: without what the robot carries; time_s: since the first joint state.
+    bare: surface without carried boxes; time_s: since the first joint state.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
@@ -149,9 +150,10 @@ def contact_seeds(
     num_threads: int = 1,
     each: Each = map,
 ) -> Seeds:
-    """Seeds on objects near the robot without a splat's centre within `contact_radius`.
+    """Seeds on objects near the robot where no splat's centre is within `contact_radius`.
 
-    Their radius is half of it: larger splats stand out of a plane. mappable: pixels (H, W) of each frame.
+    Their radius is half of `contact_radius`: larger splats protrude from a plane. mappable: pixels (H, W) of each
+    frame.
     """
     radius = config.contact_radius
     near_robot = each(lambda one, pixels: contact_pixels(one[0], one[1], robot) & pixels, seen, mappable)
@@ -194,7 +196,7 @@ def hidden_objects(
 ) -> Index:
     """Slots (K,) of objects within `reach` [m] of the robot or base that no pixel shows.
 
-    Fitting would pull them out of their object.
+    Fitting would pull their splats out of the object.
     """
     if robot is None:
         return np.zeros(0, np.intp)

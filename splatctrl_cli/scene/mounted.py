@@ -1,4 +1,4 @@
-"""Pixels of parts on a moving camera, such as a gripper: neither seeded nor compared."""
+"""Pixels of parts on a moving camera, such as a gripper: never seeded or compared."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from splatctrl_cli.records import Bool, Float64, RgbdFrame
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """The first frames, at most `MOUNTED_MAX_VIEWS`, over `MOUNTED_APART` [m] apart."""
+    """The first frames over `MOUNTED_APART` [m] apart, at most `MOUNTED_MAX_VIEWS`."""
     chosen: list[RgbdFrame] = []
     for frame in frames:
         away = [np.linalg.norm(frame.T_world_camera[:3, 3] - other.T_world_camera[:3, 3]) for other in chosen]
@@ -20,9 +20,10 @@ def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
 
 
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
-    """Pixels (H, W) of what moves with one camera, by `spread_views`; None for fewer than six.
+    """Pixels (H, W) of parts that move with one camera; None for fewer than six frames.
 
-    They keep their colour, are not flat, and rarely have depth over `min_range` [m].
+    frames: from `spread_views`. The pixels keep their colour, have texture, and rarely have depth over `min_range`
+    [m].
     """
     if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
@@ -38,7 +39,7 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
-    """Median colour in [0, 1] of counted pixels (H, W) away from depth, else black."""
+    """Median colour in [0, 1] of counted pixels (H, W) away from depth; black if these are few."""
     depth_near = [uniform_filter((f.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4 for f in frames]
     away = [mask & ~is_near for mask, is_near in zip(counted, depth_near, strict=True)]
     colors = np.concatenate([frame.color[mask] for frame, mask in zip(frames, away, strict=True)])

@@ -1,4 +1,4 @@
-"""The occupancy grid of III-C: space seen free, occupied, or never."""
+"""The occupancy grid of III-C: free, occupied and never-seen space."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -55,8 +55,8 @@ class OccupancyMap:
     def take_in(self, frames: Sequence[RgbdFrame]) -> None:
         """Add the depth images of one time step; human pixels set the human bit.
 
-        Rays that pass a voxel clear its human and solid bits. If masked images hit it with other pixels alone, they
-        clear the human bit, too.
+        Rays that pass a voxel clear its human and solid bits. If masked images hit it only with non-human pixels,
+        they clear the human bit, too.
         """
         self._begin_step(frames)
         self._was_free = self.log_odds < 0
@@ -83,9 +83,9 @@ class OccupancyMap:
     def integrate(self, frame: RgbdFrame) -> None:
         """Add one depth image: voxels are free along its rays, hit at their ends.
 
-        A voxel with a pixel's point is a hit, else a miss if its centre is before its pixel's depth. A pixel without
-        depth takes the nearest one's, while their rays are within half a voxel. Depth below min_range does not count;
-        beyond max_range it only frees.
+        A voxel with a pixel's point is a hit. Otherwise it is a miss if its centre is before its pixel's depth. A
+        pixel without depth uses the nearest pixel's depth, while their rays are within half a voxel. Depth below
+        `min_range` does not count; depth beyond `max_range` only frees.
         """
         config = self.config
         native.integrate_depth(
@@ -106,7 +106,7 @@ class OccupancyMap:
         self.last_seen[i[is_never], j[is_never], k[is_never]] = reason
 
     def unexplained(self, centers: Float64, radii: Float64) -> Index:
-        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] with changeable reasons."""
+        """Flat indices (K,) of never-seen voxels in spheres (S, 3), (S,) [m] whose reason can change."""
         is_near = np.zeros(self.entity.shape, bool)
         native.mark_spheres(self._packed, is_near.view(np.uint8), centers, radii, 1, self.num_threads)
         voxels = np.flatnonzero(is_near)
@@ -124,7 +124,8 @@ class OccupancyMap:
         """Set the robot bit only where spheres (S, 3), (S,) [m] or pixels show the robot.
 
         seen: frames of one time step, pixels (H, W) of robot and objects. A voxel that an object pixel hits is solid,
-        not robot, until rays pass or robot pixels alone hit; a swept one falls to the log-odds of one hit.
+        not robot, until rays pass it or only robot pixels hit it. If it was swept, its log-odds fall to those of one
+        hit.
         """
         before, entity, log_odds = self.entity.flatten(), self.entity.reshape(-1), self.log_odds.reshape(-1)
         self.mark_robot(centers, radii)
@@ -142,7 +143,7 @@ class OccupancyMap:
     def _hide_beside(self, arrived: Index, num_steps: int) -> None:
         """Forget views of space within `HIDDEN` of voxels (K,) of an arrived object.
 
-        The last `num_steps` steps stay.
+        Views of the last `num_steps` steps stay.
         """
         reach = math.ceil(fixed.HIDDEN / self.config.voxel)
         cells = np.stack(np.unravel_index(arrived, self.entity.shape), axis=1)
@@ -153,7 +154,7 @@ class OccupancyMap:
         self.last_seen[i[is_old], j[is_old], k[is_old]] = Unseen.HIDDEN_BY_THING
 
     def forget_hidden(self, centers: Float64, radii: Float64, is_within: Callable[[Float32, float], Bool]) -> None:
-        """Clear solid voxels within the robot that connect to none outside.
+        """Clear solid voxels within the robot, unless they connect to solid voxels outside.
 
         Spheres (S, 3), (S,) [m] contain the robot; is_within: `RobotPosture.is_within`.
         """
@@ -172,7 +173,7 @@ class OccupancyMap:
         crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
-        """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark these swept."""
+        """Set the robot bit only in voxels that spheres (S, 3), (S,) [m] meet; mark them swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         native.mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
@@ -203,7 +204,7 @@ class OccupancyMap:
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
         """Largest occupancy (N,) of the eight nearest voxels; True (N,) if any was seen.
 
-        Never-seen voxels do not count; one half if all are.
+        Never-seen voxels do not count; if all are, it is one half.
         """
         base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
         limit = np.array(self.log_odds.shape) - 1
@@ -221,7 +222,7 @@ class OccupancyMap:
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
-        # Those swept, without an object since, may be the robot's.
+        # Swept voxels that no object pixel hit since may be the robot's.
         return np.asarray(voxels[self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) != SWEPT])
 
     def swept_box(self) -> Box | None:

@@ -15,8 +15,8 @@ from splatctrl_cli.robot.surface import RobotSurface
 class RobotPosture:
     """The robot's spheres and surface.
 
-    centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4); surface: None if only spheres are known;
-    surfaces: by frame stamp [ns], where different; T_world_surface: by stamp (L, 4, 4).
+    centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4). surface: None if only spheres are known.
+    surfaces: by frame stamp [ns], where different from `surface`. T_world_surface: link poses (L, 4, 4) by stamp.
     """
 
     centers: Float64
@@ -28,7 +28,7 @@ class RobotPosture:
     num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
-        """Surface, or else spheres, and poses (L, 4, 4) of its links at a stamp."""
+        """Surface at a stamp (else the spheres), and poses (L, 4, 4) of its links."""
         if self.surface is None:
             return RobotSurface.from_balls(self.centers, self.radii), np.eye(4)[None]
         return self.surfaces.get(stamp_ns, self.surface), self.T_world_surface[stamp_ns]
@@ -43,7 +43,7 @@ class RobotPosture:
     ) -> Float64:
         """Signed distance (N,) [m] of points (N, 3) to the robot at the newest stamp, negative inside.
 
-        to_moving: only to links that joints move; within, enough: as in `RobotSurface.distance`.
+        to_moving: only to links that joints move. within, enough: as in `RobotSurface.distance`.
         """
         surface, T = self.seen_at(max(self.T_world_surface, default=0))
         without = surface.fixed if to_moving else ()
@@ -52,12 +52,12 @@ class RobotPosture:
         )
 
     def is_within(self, points_world: Floats, reach: Floats | float, *, to_moving: bool = False) -> Bool:
-        """Points (N, 3) at a signed `distance` of at most `reach` (N,) [m]: much faster."""
+        """True for points (N, 3) at a signed distance of at most `reach` (N,) [m]; faster than `distance`."""
         distance = self.distance(points_world, to_moving=to_moving, within=np.maximum(reach, 0.0), enough=reach)
         return np.asarray(distance <= reach)
 
     def holds(self, points_world: Floats, depth: float) -> Bool:
-        """Points (N, 3) at least `depth` [m] inside a fully drawn robot: no object is there."""
+        """True for points (N, 3) at least `depth` [m] inside a fully drawn robot, where no object is."""
         if self.surface is None or not self.surface.is_drawn:
             return np.zeros(len(points_world), bool)
         return self.is_within(points_world, -depth)

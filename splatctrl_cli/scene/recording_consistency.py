@@ -15,9 +15,9 @@ from splatctrl_cli.scene.seeding import world_points
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Distance |dz| [m] between surfaces that two cameras both see: median and lower quartile.
+    """Median and lower quartile of |dz| [m], how far two cameras disagree on depth.
 
-    depth [m]: of these surfaces; detour [m]: least sum of medians by way of a third camera.
+    depth [m]: median of their common surfaces. detour [m]: least sum of two medians by way of a third camera.
     """
 
     cameras: tuple[str, str]
@@ -29,23 +29,27 @@ class Agreement:
 
     @property
     def limit(self) -> float:
-        """Limit of good cameras [m]: 3 cm, beyond 1 m 3 % of depth (2 % each, independent)."""
+        """Largest median of good cameras [m]: 3 cm, or 3 % of depth beyond 1 m.
+
+        Each may be off by 2 %, independently.
+        """
         return fixed.PAIR_LIMIT * max(1.0, self.depth)
 
     @property
     def holds(self) -> bool:
-        """False if median and detour exceed the limit, and the quartile half of it."""
+        """False if median and detour exceed `limit`, and the quartile exceeds half of `limit`."""
         return min(self.median, self.detour) <= self.limit or self.quartile <= 0.5 * self.limit
 
 
 CAUSES = "poses are off, or too little depth is left (short range, clip, holes) to see the same sides of objects"
-"""Of views that disagree: the depths alone do not tell one from the other."""
+"""Causes of views that disagree; depth does not show which one applies."""
 
 
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
-    """Agreement of camera pairs with enough common pixels, at once or of a still scene.
+    """Agreement of camera pairs with enough common pixels.
 
-    Views of one camera are paired, too. Depth counts from `min_range` to `max_range` [m].
+    frames: of one time, or a still scene. Views of one camera are paired, too. Depth counts from `min_range` to
+    `max_range` [m].
     """
     chosen = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
     by_pair: dict[tuple[str, str], list[Float64]] = {}
@@ -76,7 +80,10 @@ def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
 
 
 def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) -> Float64:
-    """|dz| and depth (K, 2) [m] in view b, of view a's points within `PAIR_SAME_SURFACE` of b's depth."""
+    """Columns |dz| and b's depth (K, 2) [m], at view a's points projected into view b.
+
+    Points with |dz| over `PAIR_SAME_SURFACE` do not count.
+    """
     stride = max(1, a.intrinsics.height // fixed.PAIR_ROWS)
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
@@ -105,7 +112,7 @@ class PoseJump:
 def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
     """Longest move of a camera between frames at most a second apart; None without frames.
 
-    poses: stamp [ns], camera and T_world_camera, by stamp.
+    poses: stamp [ns], camera and T_world_camera, in order of stamp.
     """
     last: dict[str, tuple[int, Float64]] = {}
     largest: PoseJump | None = None

@@ -22,7 +22,8 @@ def nearest_depth(
 ) -> tuple[Float32, Float32]:
     """Least valid depth (H, W) [m] within `reach` [m] of each pixel, with and without the robot.
 
-    inf: no depth. `reach` is at the median depth. Robot pixels then count for themselves and neighbours only.
+    inf: no depth. `reach` becomes pixels at the median depth. In the second image, robot pixels count only for
+    themselves and neighbours.
     """
     is_valid = frame.depth > 0
     depth, valid = np.where(is_valid, frame.depth, np.float32(np.inf)), frame.depth[is_valid]
@@ -48,10 +49,10 @@ def removals(
 ) -> dict[str, Bool]:
     """Masks (M,) of live splats to remove, each under its first reason in `REASONS`.
 
-    broken: not finite. workspace: outside. opacity: below alpha_min. free: all voxels around observed free.
-    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 beyond the patience. trail: no longer
-    robot or human. Set elsewhere: robot, evicted, weak. Splats in never-seen space stay, unless the rule is
-    "literal". counts_time: towards the patience.
+    broken: not finite. workspace: outside. opacity: below alpha_min. free: all seen voxels around are free.
+    seen_through: floats before measured depth. uncertain: occupancy 0.3 to 0.7 for longer than the patience. trail:
+    no longer robot or human. Set elsewhere: robot, evicted, weak. Splats in never-seen space stay, unless the rule is
+    "literal". counts_time: counts towards the patience.
     """
     config = occupancy.config
     centers = buffer.centers
@@ -85,10 +86,10 @@ def removals(
 def room_for(
     seeds: Seeds, num: int, buffer: SplatBuffer, occupancy: OccupancyMap, shown: Float64, tolerance: float
 ) -> tuple[Bool, Seeds]:
-    """Slots (M,) of at most `num` splats to evict, and the seeds in order of service.
+    """Mask (M,) of at most `num` splats to evict; the seeds, nearest to the path first.
 
-    Object splats only: redundant ones that show least, then far ones. shown (M,): by slot; tolerance [m]: of
-    `find_redundant`.
+    Only object splats go: redundant ones that show least, then ones far from the path. shown (M,): blended opacity by
+    slot; tolerance [m]: of `find_redundant`.
     """
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_mapped)
     stands = splats.labels != Label.ROBOT
@@ -115,10 +116,10 @@ def find_redundant(
     tolerance: float,
     num_threads: int = 1,
 ) -> Index:
-    """The first splats of `order`, at most `num_wanted`, that the others together can replace.
+    """The first splats of `order`, at most `num_wanted`, that other splats can replace.
 
     splats: N of objects and people; voxels (K, 3) [m]: occupied centres. A splat represents voxels within `tolerance`
-    [m] of its sphere, among the eight nearest centres. It may go if its voxels keep another.
+    [m] of its sphere, if among their eight nearest splats. It may go if other splats represent all its voxels.
     """
     if not len(order) or not len(voxels) or num_wanted < 1:
         return np.zeros(0, np.intp)
@@ -141,7 +142,7 @@ def find_redundant(
 
 
 def find_far(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> Index:
-    """Choose `num_wanted` splats (N, 3) or fewer to evict for seeds (K, 3), farthest first.
+    """Choose at most `num_wanted` splats (N, 3) to evict for seeds (K, 3), farthest first.
 
     Each is at least EVICT_NEARER farther from the path than its seed.
     """
@@ -162,9 +163,9 @@ def distance_to_box(points: Float32, box: Box) -> Float64:
 def clone_shape(opacity: Float64, radius: Float64, count: Index) -> tuple[Float64, Float64]:
     """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies.
 
-    The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity over the screen, `r' = r sqrt(alpha
-    / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et al. 2024, eq. 9)
-    loses a few percent.
+    The copies conserve the peak: `a = 1 - (1 - alpha)^(1/N)`. They also conserve the blended opacity over the screen
+    (2-D rule): `r' = r sqrt(alpha / sum_{i=1..N} (1 - (1 - a)^i) / i)`. The 1-D rule of 3DGS-MCMC (Kheradmand et al.
+    2024, eq. 9) loses a few percent.
     """
     a = 1.0 - (1.0 - opacity) ** (1.0 / count)
     mass = np.zeros_like(opacity)
@@ -198,15 +199,15 @@ def use_idle(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> tuple[Filled, int]:
-    """Use dead slots beyond the reserve as `when_idle` says; count weak splats removed.
+    """Fill dead slots beyond the reserve by `when_idle`; count weak splats removed.
 
-    misfits: of the views, and how much each slot (M,) shows.
+    misfits: returns each view's misfit, and each slot's blended opacity (M,).
     """
     is_alive, reserve = buffer.is_alive, int(config.gap_reserve * config.max_splats)
     if config.when_idle == "leave" or not is_alive.any():
         return Filled(), 0
     misfit_views, shown = ([], None) if config.when_idle == "clone" else misfits()
-    if shown is None or not any(error.any() for _, error in misfit_views):  # no depth shows where detail would be
+    if shown is None or not any(error.any() for _, error in misfit_views):  # no depth shows where detail is missing
         return clone(buffer, int((~is_alive).sum()) - reserve, rng), 0
     weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
     is_weak = np.zeros(len(is_alive), bool)
@@ -217,9 +218,10 @@ def use_idle(
 
 
 def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
-    """Place `num_seeds` pixel-sized seeds or fewer on measured surfaces, drawn by squared colour error.
+    """Place at most `num_seeds` pixel-sized seeds on measured surfaces, drawn by squared colour error.
 
-    The error is a 3 x 3 mean, weighted by a pixel's area of surface. No two seeds are closer than their diameters.
+    The error is a 3 x 3 mean; its square is weighted by a pixel's area on the surface. Seeds are at least a diameter
+    apart.
     """
     every = thinning(error > 0 for _, error in misfits)
     masks = [thin_mask(error > 0, every) for _, error in misfits]
@@ -238,9 +240,10 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
 
 
 def draw_indices(weight: Float64, count: int, rng: np.random.Generator) -> Index:
-    """Draw `count` different indices in proportion to weight (K,), at least `count` of them positive.
+    """Draw `count` different indices in proportion to weight (K,).
 
-    As ``rng.choice(K, count, replace=False, p=weight / weight.sum())``, but faster.
+    At least `count` weights must be positive. It draws like ``rng.choice(K, count, replace=False, p=weight /
+    weight.sum())``, but faster.
     """
     left = weight / weight.sum()
     indices = np.zeros(0, np.intp)

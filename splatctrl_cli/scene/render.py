@@ -37,7 +37,7 @@ class Rendering:
     opacity: Float32
 
     def normalised_depth(self) -> Float32:
-        """Depth / opacity (H, W) [m] for opacity of 0.5 or more, else 0."""
+        """Depth / opacity (H, W) [m] where opacity is at least 0.5, else 0."""
         is_opaque = self.opacity >= fixed.OPAQUE_ENOUGH
         return np.where(is_opaque, self.depth / np.where(is_opaque, self.opacity, 1.0), 0.0).astype(np.float32)
 
@@ -105,7 +105,7 @@ PER_CHANNEL = 16  # harmonics
 
 
 def parameters_of(gaussians: GaussianSet) -> Float32:
-    """Parameters (N, 59); opacities 0 and 1 become the nearest finite logit."""
+    """Parameters (N, 59); logits of opacity are limited to `LARGEST_LOGIT` in size."""
     rows = np.zeros((len(gaussians), NUM_PARAMETERS), np.float32)
     rows[:, CENTER] = gaussians.centers
     rows[:, LOG_SCALE] = np.log(gaussians.scales)

@@ -19,9 +19,9 @@ POWERS: Mapping[str, Mapping[str, int]] = {
     },
     "occupancy": {**dict.fromkeys(("voxel", "min_range", "max_range", "see_through"), 1), "depth_error": -1},
 }
-"""The power of a length in each setting that has one: recordings of one scene in two units then give one map.
+"""Power of a length in each setting with lengths; one scene recorded in two units gives one map.
 
-Lengths of the robot and its contacts are not among them.
+Lengths of the robot and its contacts do not scale.
 """
 
 
@@ -40,7 +40,7 @@ class RecordedDepth:
 
     @classmethod
     def of(cls, frames: Sequence[RgbdFrame]) -> "RecordedDepth | None":
-        """Measure valid pixels of every eighth row and column; None without any."""
+        """Measure valid pixels of every eighth row and column; None without valid pixels."""
         seen = [frame.depth[::8, ::8] for frame in frames]
         depth = np.concatenate([image[image > 0] for image in seen]) if seen else np.zeros(0)
         if not len(depth):
@@ -59,9 +59,9 @@ class RecordedDepth:
 def depth_noise(images: Sequence[Float32]) -> float:
     """Standard deviation [1/m] of one camera's inverse depth (H, W); 0 if unknown.
 
-    At depth z it is that times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
-    Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Wider blocks may raise it, up to
-    twice.
+    Depth z deviates by this times z^2, as in disparity sensors (Khoshelham and Elberink 2012: 1.425e-3 of a Kinect).
+    Residuals of linear fits to blocks are noise; a low quantile leaves out edges. Wider blocks may at most double the
+    result.
     """
     narrow, *wider = (_linear_noise(images, times) for times in (1, *fixed.NOISE_WIDER))
     return max(narrow, min(max(wider), 2 * narrow))
@@ -86,9 +86,9 @@ def _linear_noise(images: Sequence[Float32], times: int) -> float:
 def fitted_to(config: Config, depth: RecordedDepth, *, has_robot: bool = False) -> Config:
     """`config` with defaults fitted to the recording; the same object if nothing changes.
 
-    Lengths scale by `scene.scale`, or if 0, by the median depth over a table's at arm's length. min_radius becomes at
-    most a pixel, min_range at most half the nearest depth, max_range at least the farthest. With a robot, scale 0
-    scales nothing; a larger recorded error counts.
+    Lengths scale by `scene.scale`; if it is 0, by the median depth relative to a table's at arm's length. Then
+    min_radius becomes at most a pixel, and max_range at least the farthest depth. min_range grows to half the nearest
+    depth at most. With a robot, scale 0 scales nothing, and larger recorded noise replaces `depth_error`.
     """
     least = OccupancyConfig().depth_error
     if has_robot and depth.noise > least == config.occupancy.depth_error:
@@ -123,7 +123,7 @@ def describe_scale(config: Config, depth: RecordedDepth) -> str:
 
 
 def scale_lengths(section: Lengths, scale: float) -> Lengths:
-    """Multiply defaults by the power of `scale` that a length has in them."""
+    """Multiply each setting at its default by `scale` to its power in `POWERS`."""
     powers, default = POWERS[section.section], type(section)()
     values = {key: getattr(section, key) for key in powers}
     return section.derived(

@@ -1,6 +1,6 @@
 """Seeds of new splats, from first frames and unexplained pixels (M_add, eq. 5).
 
-The paper seeds every pixel. Here nested cubes get one splat each: a cube splits while its points differ in colour or
+The paper seeds every pixel. Here nested cubes get one splat each. A cube splits while its points differ in colour or
 lie off a plane.
 """
 
@@ -38,7 +38,7 @@ def camera_in_world(frame: RgbdFrame) -> Float64:
 def world_points(frame: RgbdFrame, mask: Bool | None = None, num_threads: int = 1) -> Float64:
     """Back-projected points [m], world: (K, 3) of a mask (H, W), else (H, W, 3).
 
-    The latter are meaningless where depth is 0.
+    Points with depth 0 are meaningless.
     """
     points = back_projected(camera_in_world(frame), frame.depth, mask, num_threads)
     return points.reshape(*frame.depth.shape, 3) if mask is None else points
@@ -52,9 +52,9 @@ def inside_workspace(frame: RgbdFrame, workspace: Box, min_range: float = 0.0, n
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
     """M_add (H, W): pixels to seed, eq. 5 with a term for holes.
 
-    Holes are mappable pixels with opacity below `hole_opacity`. Others are seeded if closer than the map by more than
-    lambda_MDE times the median depth error. The median is over explained mappable pixels; the threshold is bounded,
-    the map's depth normalised by opacity.
+    Holes are mappable pixels with opacity below `hole_opacity`. Other pixels are seeded if closer than the map by
+    more than lambda_MDE times the median depth error. The median is over mappable pixels outside holes; the threshold
+    is bounded. The map's depth is normalised by opacity.
     """
     images = (rendering.depth, rendering.opacity, frame.depth)
     error, sizes = np.empty(frame.depth.shape, np.float32), np.empty(frame.depth.size, np.float32)
@@ -68,7 +68,7 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
 
 
 def thinning(masks: Iterable[Bool]) -> int:
-    """Step n that leaves about `SEED_MOST_PIXELS` of masks (H, W), or fewer."""
+    """Step n that leaves at most about `SEED_MOST_PIXELS` of masks (H, W)."""
     return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / fixed.SEED_MOST_PIXELS))
 
 
@@ -95,9 +95,9 @@ def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Seeds:
 
 @dataclass(frozen=True, kw_only=True)
 class CubeLevel:
-    """Occupied cubes of one size: points (K, 3) [m], means, and parent (K,) one level up.
+    """Occupied cubes of one size: points (K, 3) [m], means, and parent cube (K,) one level up.
 
-    A cube's point is the measured one nearest to the mean.
+    A cube's point is the measured point nearest to the mean.
     """
 
     edge: float
@@ -107,7 +107,7 @@ class CubeLevel:
 
     @cached_property
     def detail(self) -> Float64:
-        """Number of points times (colour variance + SEED_BEND * least position variance / edge^2), (K,)."""
+        """Detail (K,): number of points times (colour variance + SEED_BEND * least position variance / edge^2)."""
         means = self.means
         color_variance = (means.square - means.color**2).sum(axis=1)
         covariance = means.covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
@@ -133,7 +133,7 @@ def cube_levels(
 
 
 def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
-    """Masks (K,) per level of standing cubes: one splits while its detail exceeds `tolerance`."""
+    """Masks (K,) per level of unsplit cubes; a cube splits while its detail exceeds `tolerance`."""
     masks, is_reached = [], np.ones(len(levels[0].points), bool)
     for level, below in pairwise(levels):
         is_split = is_reached & (level.detail > tolerance)
@@ -143,7 +143,7 @@ def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
 
 
 def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
-    """Least tolerance (to 1 %) for at most `count` cubes; infinite if even the coarsest are more."""
+    """Least tolerance (to 1 %) for at most `count` cubes; infinite if the coarsest cubes are more."""
     if len(levels[0].points) > count:
         return float("inf")
     low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6
@@ -166,7 +166,7 @@ class SeedDensity:
 def density_for(sources: Sequence[Seeds], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """Density that spends at most `count` seeds on the candidates.
 
-    The edge starts at the largest splats, and grows by 5 % while cubes are too many.
+    The edge starts at the largest splats, and grows by 5 % while there are more than `count` cubes.
     """
     everything = sources[0].joined(*sources[1:])
     points = everything.centers
@@ -185,9 +185,9 @@ def seeds_at(
     config: SceneConfig,
     num_threads: int = 1,
 ) -> Seeds:
-    """One seed per standing cube over the candidates, finest cubes first.
+    """One seed per unsplit cube over the candidates, finest cubes first.
 
-    None is within 0.7 edges of a live splat (L, 3). The paper's radius is min(D/f, r_max), here
+    No seed is within 0.7 edges of a live splat (L, 3). The paper's radius is min(D/f, r_max); here it is
     min(max(radius_per_edge * edge, D/f), r_max).
     """
     cloud = sources[0].joined(*sources[1:])
@@ -211,8 +211,8 @@ def gap_seeds(
 ) -> Seeds:
     """Seeds where a measured surface is further than `max_gap` [m] from every sphere.
 
-    Every `stride`-th pixel and row of the views is checked (default: about half of `max_gap` apart), and occupied
-    centres (K, 3), half a voxel off. `half` 0 or 1: only every second row. `each`: a `map` over views.
+    Every `stride`-th pixel and row of the views is checked (default: about half of `max_gap` apart). Occupied centres
+    (K, 3) may be half a voxel further. half: 0 or 1 checks only every second row. each: a `map` over views.
     """
     spheres = SplatTree(splats.centers, splats.radii, num_threads)
 

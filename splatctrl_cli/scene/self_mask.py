@@ -25,7 +25,7 @@ from splatctrl_cli.scene.time_steps import AuditRow
 class PixelKind(IntEnum):
     """Kinds of depth pixels.
 
-    MIXED: near the robot, on no surface. DOUBTED: an object if another frame measured it. CONTRADICTED: behind
+    MIXED: near the robot, on no surface. DOUBTED: an object only if another frame measured it. CONTRADICTED: behind
     another frame's surface.
     """
 
@@ -41,8 +41,8 @@ class PixelKind(IntEnum):
 class SelfMask:
     """The self-mask of a frame.
 
-    kinds (H, W): `PixelKind`; robot_depth (H, W) [m]: rendered, 0 = none; residuals: by link, measured minus rendered
-    depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`; num_inside: by link, unexplained points inside its body;
+    kinds (H, W): `PixelKind`. robot_depth (H, W) [m]: rendered, 0 = none. residuals: by link, measured minus rendered
+    depth (K,) [m] inside the outline, up to `MASK_FAR_OFF`. num_inside: by link, unexplained points inside its body.
     reach [m]: an object this close before the robot counts as robot.
     """
 
@@ -56,11 +56,11 @@ class SelfMask:
 def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
     """Self-mask of a frame, with the robot's pose at its stamp.
 
-    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths in as
-    many pixels as the tolerance spans. So is a point this near to a triangle, or inside the robot or a carried box.
-    Other depth is object, if `_judge` agrees.
+    A pixel is robot if its depth z is within `self_mask_tolerance` + 2 `depth_error` z^2 of rendered depths around it
+    (`self_mask_tolerance` in pixels). So is a point within this tolerance of a triangle, or inside the robot or a
+    carried box. Other depth is object, unless `_judge` finds too few pixels.
 
-    The image is widened by 1 / `MASK_BORDER`.
+    The robot is rendered up to 1 / `MASK_BORDER` of the width beyond the image.
     """
     k, border = frame.intrinsics, frame.intrinsics.width // fixed.MASK_BORDER
     lens = replace(k, cx=k.cx + border, cy=k.cy + border, width=k.width + 2 * border, height=k.height + 2 * border)
@@ -87,7 +87,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
         return mask
     reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
     edge = max(round(frame.intrinsics.width / fixed.MASK_EDGE), reach)
-    wide = 2 * edge + reach + 1  # pixels, beyond which nothing is explained, doubted or inside
+    wide = 2 * edge + reach + 1  # pixels from the robot, beyond which none is explained, doubted or inside
     part = grow_box(box, wide + 1, frame.depth.shape)  # one more, where a surface may extend
     depth, rendered, kinds = np.ascontiguousarray(frame.depth[part]), shown.depth[part], kinds[part]
     link, inside = shown.link[part], shown.inside[part]
@@ -133,7 +133,7 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
     offset = depth - rendered
     is_told = is_core & has_depth & (np.abs(offset) <= fixed.MASK_FAR_OFF)
     is_told &= link < len(surface.links) - surface.num_carried
-    is_told &= rendered - nearest < fixed.MASK_STEP  # stereo may give it the depth of a nearer part next to it
+    is_told &= rendered - nearest < fixed.MASK_STEP  # stereo may show the depth of a nearer part there
     is_told &= ~is_occluded(offset, np.where(is_robot & has_depth, link, np.int16(-1)))
     is_inside = is_core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
@@ -150,8 +150,8 @@ def _mask_within(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig)
 def is_occluded(offset: Float32, link: Int16) -> Bool:
     """True for pixels (H, W) of an object before a link (-1: none).
 
-    offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of its pixels are over
-    `MASK_FAR_OFF` before it. Then pixels more than `MASK_STEP` before the link show it.
+    offset: measured less rendered depth [m]. An object occludes a link if over `MASK_OCCLUDED` of the link's pixels
+    are over `MASK_FAR_OFF` before the link. Then pixels more than `MASK_STEP` before the link show the object.
     """
     number = link.astype(np.int64) + 1
     num_before = np.bincount(number.ravel(), (offset < -fixed.MASK_FAR_OFF).ravel())
@@ -162,7 +162,7 @@ def is_occluded(offset: Float32, link: Int16) -> Bool:
 def is_mixed(depth: Float32, is_object: Bool, tolerance: Float32, reach: int, fx: float) -> Bool:
     """True for object pixels (H, W) within `reach` pixels of a nearer object and a farther surface.
 
-    Time-of-flight cameras mix their depths. The object is nearer than a surface tilted by `MASK_STEEP`.
+    Time-of-flight cameras mix the two depths. The object is nearer than a surface tilted by `MASK_STEEP` explains.
     """
     apart = np.maximum(np.float32(fixed.MASK_STEP), np.float32(fixed.MASK_STEEP * reach / fx) * depth)
     is_behind = depth - nearest_within(depth, is_object, reach) > apart
@@ -178,8 +178,9 @@ def _fixed_outline(surface: RobotSurface, is_robot: Bool, link: Int16) -> Bool:
 def _judge(kinds: UInt8, depth: Float32, is_near: Bool, area: Float64, steps: Float32) -> None:
     """Mark object pixels near the robot that are too few to believe, in place.
 
-    A piece joins neighbours that differ by less than both `steps` [m]. It is an object if it extends away from the
-    robot. Otherwise the unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below `MASK_ALONE`.
+    A piece joins neighbours whose depths differ by less than both `steps` [m]. It is an object if it extends away
+    from the robot. Otherwise its unexplained `area` [m^2] decides: mixed below `MASK_SPECK`, doubted below
+    `MASK_ALONE`.
     """
     is_object, shown = kinds == PixelKind.OBJECT, np.empty(depth.shape)
     doubtful = is_object & is_near
@@ -191,10 +192,10 @@ def _judge(kinds: UInt8, depth: Float32, is_near: Bool, area: Float64, steps: Fl
 def settle_pieces(
     frame: RgbdFrame, mask: SelfMask, others: Sequence[tuple[RgbdFrame, SelfMask]], config: OccupancyConfig
 ) -> SelfMask:
-    """Mask with each doubted piece decided: object or mixed.
+    """Mask whose doubted pieces become object or mixed.
 
-    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` (other cameras', settled
-    ones of the last step) measured half of it, or without any.
+    A piece joins neighbours within `MASK_STEP` in depth. It is an object if one of `others` measured half of it, or
+    without `others`. others: other cameras' frames, and settled frames of the last step.
     """
     box = find_outline(mask.kinds == PixelKind.DOUBTED)
     if box is None:
@@ -221,8 +222,8 @@ def settle_pieces(
 def outvote_objects(seen: Sequence[tuple[RgbdFrame, SelfMask]], origin: Float64, voxel: float) -> list[SelfMask]:
     """Masks of one time step without object pixels that robot pixels outvote.
 
-    Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Below `VOTE_SHARE` of the robot pixels,
-    object pixels become mixed.
+    Frames vote in voxels of a grid with first centre `origin` (3,) [m]. Object pixels fewer than `VOTE_SHARE` times a
+    voxel's robot pixels become mixed.
     """
     outvoted, masks = [], [replace(mask, kinds=mask.kinds.copy()) for _, mask in seen]
     for frame, mask in seen:
@@ -249,13 +250,13 @@ def _group_by_link(values: Array, links: Int16, names: Sequence[str]) -> dict[st
 
 
 def find_outline(pixels: Bool) -> tuple[slice, slice] | None:
-    """Rows and columns of the box about a mask's pixels (H, W); None without any."""
+    """Rows and columns of the box around a mask's pixels (H, W); None without pixels."""
     left, top, width, height = cv2.boundingRect(pixels.view(np.uint8))
     return (slice(top, top + height), slice(left, left + width)) if width else None
 
 
 def grow_box(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Box with so many pixels more on each side, within an image."""
+    """Box with `pixels` more on each side, limited to an image."""
     rows, columns = (
         slice(max(part.start - pixels, 0), min(part.stop + pixels, size))
         for part, size in zip(box, shape, strict=True)
@@ -298,7 +299,7 @@ def tolerance_at(depth: Float32, config: OccupancyConfig, sigmas: float = fixed.
 
 
 def audit_masks(masks: Sequence[SelfMask]) -> dict[str, Any]:
-    """`self_mask` and `inside_robot` of `AuditRow`, by link that a mask saw.
+    """`self_mask` and `inside_robot` of `AuditRow`, for each link in a mask.
 
     sign: 1 if the robot is measured behind its rendered surface, -1 before it; reach: the least `SelfMask.reach`.
     """
@@ -323,9 +324,9 @@ def audit_masks(masks: Sequence[SelfMask]) -> dict[str, Any]:
 def self_mask_metrics(rows: Sequence[AuditRow], holding: Collection[str] = ()) -> dict[str, Any]:
     """Part of the self-mask in ``run.json``, over all time steps.
 
-    `self_mask`: by link, median residual and reach [mm], and pixels; `self_mask_residual_mm`: the largest size of
-    judged links' residuals, None without any; `inside_robot_points`, with the first step and link. Links with at
-    least `MASK_PIXELS` are judged, learned ones in `holding` only if no others are.
+    `self_mask`: by link, median residual and reach [mm], and pixels. `self_mask_residual_mm`: largest absolute
+    residual of judged links, or None. `inside_robot_points`: with their first step and link. Links with at least
+    `MASK_PIXELS` are judged; links in `holding` (a learned part) only if no others are.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
     pixels = {link: sum(row.self_mask[link]["num_pixels"] for row in rows if link in row.self_mask) for link in links}

@@ -1,4 +1,4 @@
-"""Depth of one surface: its mean over time; its steps at a robot's outline."""
+"""Mean depth of a surface over time, and its depth steps at the robot's outline."""
 
 from dataclasses import replace
 
@@ -18,9 +18,9 @@ def steady_depth(
 ) -> tuple[RgbdFrame, Bool]:
     """Frame with a running mean of its depth, and its steady pixels (H, W).
 
-    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2, and depths
-    around it by `STEADY_MOVED` `depth_error` z^2 on average. Only objects are averaged. Without `before`, no pixel is
-    steady; if the camera moved, all are, unaveraged.
+    An object pixel is steady if its depth z [m] changed by at most `STEADY_SIGMAS` `depth_error` z^2. Also, depth
+    around it changed by at most `STEADY_MOVED` `depth_error` z^2 on average. Only objects are averaged. Without
+    `before`, no pixel is steady. If the camera moved, all pixels are steady and none is averaged.
     """
     if before is None or before[1].shape != frame.depth.shape:
         return frame, np.zeros(frame.depth.shape, bool)
@@ -39,7 +39,7 @@ def steady_depth(
 
 
 def object_twice(frame: RgbdFrame, before: Before, is_steady: Bool) -> Bool:
-    """Steady pixels (H, W) that showed an object twice; all of them if the camera moved."""
+    """Steady pixels (H, W) that showed an object twice; all steady pixels if the camera moved."""
     if before is None or not np.array_equal(before[0].T_world_camera, frame.T_world_camera):
         return is_steady
     return is_steady & before[1] if before[1].shape == is_steady.shape else is_steady
@@ -50,10 +50,10 @@ def surface_steps(
 ) -> Float32:
     """Largest depth step (H, W) [m] from each pixel to a neighbour on its surface.
 
-    It is `MASK_STEP`. In the robot's outline (is_edge), `edge` pixels wide, an object pixel off its plane by more
-    than `tolerance` (H, W) [m] gets half that distance, if less.
+    It is at most `MASK_STEP`. In the robot's outline (is_edge), `edge` pixels wide, object pixels off their plane by
+    more than `tolerance` (H, W) [m] get half that distance.
 
-    The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if
+    The plane fits 1 / depth of object pixels beyond the outline, within `MASK_PLANES` widths. It counts if its
     residuals match the sensor (`depth_error` [m] at 1 m) and its variance is at most `MASK_UNSURE` of a pixel's.
     """
     steps = np.full(depth.shape, fixed.MASK_STEP, np.float32)

@@ -17,8 +17,8 @@ from splatctrl_cli.scene.seeding import thin_mask, thinning, world_points
 class TimeStep:
     """Frames taken together (with a clock, one per camera), and joint positions.
 
-    position (J,) at the last frame, in the source's joint order, None without a near joint state; velocity (J,)
-    [1/s].
+    position (J,): at the last frame, in the source's joint order; None without a joint state within `JOINTS_GAP_NS`.
+    velocity (J,) [1/s].
     """
 
     frames: tuple[RgbdFrame, ...]
@@ -27,7 +27,7 @@ class TimeStep:
 
     @property
     def positions(self) -> dict[int, Float64]:
-        """Joint positions (J,) by frame stamp [ns]; empty without a near joint state."""
+        """Joint positions (J,) by frame stamp [ns]; empty without `position`."""
         if self.position is None or self.velocity is None:
             return {}
         last_ns = self.frames[-1].stamp_ns
@@ -52,7 +52,7 @@ class TimeStep:
 class AuditRow:
     """Result of one time step.
 
-    Counts are of splats; loss (eq. 4) and PSNR [dB] of the newest frames at their last iteration, None if none shows
+    Counts are of splats. loss (eq. 4), psnr [dB]: of the newest frames at their last iteration, None if none shows
     the workspace. dead: reusable slots. unmet: seeds without a slot. evicted: slots given to bare surface.
     unrepresented: voxels. without_depth: frames; blind: their cameras. self_mask: by link, measured minus rendered
     depth: `median_mm`, its `sign`, `num_pixels`. inside_robot: by link, unexplained points inside.
@@ -96,9 +96,9 @@ def time_steps(
     observe: Callable[[Record], None] = lambda record: None,
     repeats: Counter[str] | None = None,
 ) -> Iterator[TimeStep]:
-    """Group frames of `cameras` by stamp, or without a clock, FRAMES_PER_STEP at a time.
+    """Group frames of `cameras` by stamp; without a clock, FRAMES_PER_STEP at a time.
 
-    With a clock, a frame with exactly its camera's last depth is skipped, and counted in `repeats` by camera.
+    With a clock, a frame whose depth equals its camera's last depth is skipped, and counted in `repeats` by camera.
     `observe` gets every record.
     """
     last_depth: dict[str, Float32] = {}
@@ -128,7 +128,7 @@ def time_steps(
 
 
 def planar(frame: RgbdFrame) -> RgbdFrame:
-    """Frame with colour by plane, as the optimiser takes it: views share memory."""
+    """Frame with colour stored by plane, so that the optimiser's views share its memory."""
     planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
     return replace(frame, color=np.moveaxis(planes, 0, 2))
 

@@ -20,8 +20,8 @@ from splatctrl_cli.voxels import SWEPT, Balls, KnownVoxels, VoxelState, voxels_a
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig, error: float = 0.0) -> Balls:
     """Occupied voxels that no splat represents, as balls labelled human or object.
 
-    A splat represents voxels with centres within `representing_reach` of its sphere, among the eight nearest. error
-    [m]: of the sensor. Robot splats do not count: fields leave them out.
+    A splat represents voxels with centres within `representing_reach` of its sphere, if among their eight nearest
+    splats. error [m]: of the sensor. Robot splats do not count: fields leave them out.
     """
     others = splats.select(splats.labels != Label.ROBOT)
     reach = representing_reach(config, occupancy.config.voxel, error)
@@ -38,7 +38,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
 def confirm_bare(balls: Balls, before: Balls | None) -> Balls:
     """Balls that touch in groups of `BARE_GROUP` or more, or that were found before.
 
-    before: of the last time step; None in the first, where all count.
+    before: balls of the last time step; None in the first, where all count.
     """
     voxel = 2.0 * balls.radius / 3**0.5
     if before is None or not len(balls):
@@ -55,7 +55,7 @@ def confirm_bare(balls: Balls, before: Balls | None) -> Balls:
 def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) -> float:
     """Largest distance [m] of a voxel's centre from a sphere that represents it.
 
-    That is `max_gap`, half a voxel, and the sensor's error [m]; at most a voxel's diagonal.
+    It is `max_gap` plus half a voxel plus the sensor's error [m], at most a voxel's diagonal.
     """
     return min(config.max_gap + 0.5 * voxel + error, 3**0.5 * voxel)
 
@@ -63,7 +63,7 @@ def representing_reach(config: SceneConfig, voxel: float, error: float = 0.0) ->
 def bare_voxels(
     occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
 ) -> Float32:
-    """Centres (K, 3) [m] of occupied voxels for gap filling, not surely near a splat.
+    """Centres (K, 3) [m] of occupied voxels that may be far from all splats, for gap filling.
 
     `half` 0 or 1 takes every second voxel.
     """
@@ -78,7 +78,7 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
     """Voxels (X, Y, Z) surely within `reach` [m] of a sphere."""
     voxel, shape = occupancy.config.voxel, occupancy.log_odds.shape
     cells = np.floor((splats.centers - occupancy.origin) / voxel + 0.5).astype(np.int64)
-    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # keeps all neighbours inside
+    is_inner = np.all((cells > 0) & (cells < np.array(shape) - 1), axis=1)  # with all neighbours inside
     home, radii = np.ravel_multi_index(tuple(cells[is_inner].T), shape), splats.radii[is_inner]
     is_near = np.zeros(shape, bool)
     for step in itertools.product((-1, 0, 1), repeat=3):
@@ -90,9 +90,9 @@ def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Boo
 
 @dataclass(frozen=True, kw_only=True)
 class GridAgreement:
-    """Agreement of splats with a grid; NaN without any.
+    """Agreement of splats with a grid; NaN without splats or voxels.
 
-    on_surface: share of object and human splats, not at never-seen voxels, in or next to a voxel that is not free.
+    on_surface: share of object and human splats in seen space that are in or next to an occupied or uncertain voxel.
     represented: share of num_voxels occupied voxels with a splat or ball.
     """
 
@@ -103,7 +103,7 @@ class GridAgreement:
 
     @property
     def holds(self) -> bool:
-        """True if both shares are as large as a reconstruction leaves them; False without any."""
+        """True if both shares reach their limits; False if one is NaN."""
         return self.on_surface >= fixed.SPLATS_ON_SURFACE and self.represented >= fixed.OCCUPIED_WITH_SPLATS
 
 
@@ -120,7 +120,7 @@ def agreement_with_grid(
     places, is_inside = voxels_at(others.centers.astype(np.float64), grid.origin, grid.voxel, states.shape)
     cells = tuple(places[is_inside].T)
     may_hold = maximum_filter(np.isin(states, (VoxelState.OCCUPIED, VoxelState.UNCERTAIN)), size=3)
-    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # space beyond the depth range is not
+    was_seen = maximum_filter(states != VoxelState.NEVER_SEEN, size=3)  # not so beyond the depth range
     num_told = was_seen[cells].sum() + np.count_nonzero(~is_inside)
     least = max(
         float(np.log(occupancy.occupied_above / (1 - occupancy.occupied_above))), 1.5 * occupancy.log_odds_hit

@@ -32,9 +32,9 @@ SPACING = 0.042  # [m] at most, between the spheres along a link
 BAR_WIDTH = 0.04  # [m] at most, of the bars that boxes are cut into to be covered
 HAND_YAW = -np.pi / 4  # the hand is mounted turned by 45 degrees
 GAP = 0.003  # [m] between a collision shape and the visual shape inside of it
-WAIST = 0.030  # [m] at the waist of a capsule whose axis is longer than `LONG`, between ends of a share `BULGE` of it
+WAIST = 0.030  # [m] less radius at a capsule's waist: axis over `LONG`, without ends of a share `BULGE`
 LONG, BULGE = 0.10, 0.05
-PEAK = 1.875  # a minimum-jerk segment's top speed by its mean
+PEAK = 1.875  # a minimum-jerk segment's top speed divided by its mean speed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ SHAPES: dict[str, tuple[Capsule | Block, ...]] = {
 def slim(shape: Capsule | Block) -> tuple[Capsule | Block, ...]:
     """Visual shapes inside a collision shape.
 
-    Over the collision surface, the visual one is 3 mm (median) and 27 mm (95 %) away, at most 30 mm.
+    Their surface is 3 mm (median) and 27 mm (95 %) inside, at most 30 mm.
     """
     if isinstance(shape, Block):
         x, y, z = (size - 2 * GAP for size in shape.size)
@@ -118,7 +118,7 @@ def _point(values: Float64) -> tuple[float, float, float]:
 
 SLIM = {link: tuple(part for shape in shapes for part in slim(shape)) for link, shapes in SHAPES.items()}
 
-# What no model of the arm has, by name: the link with which it moves, and capsules.
+# Parts that no model of the arm has, by name: the link that carries them, and their capsules.
 UNMODELLED: dict[str, tuple[str, tuple[Capsule, ...]]] = {
     "tool": ("hand", (Capsule(start=(0, 0, 0.05), end=(0, 0, 0.145), radius=0.012),)),
     "cable": (  # off the forearm by 3 to 4 cm
@@ -210,8 +210,8 @@ def arm_spheres_yaml() -> str:
 def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
-    At steps h along a segment, radius sqrt(R^2 + (h/2)^2) covers a tube of radius R (of a box's bar: half its
-    section's diagonal).
+    Spheres of radius sqrt(R^2 + (h/2)^2), at steps h along a segment, cover a tube of radius R. For a box's bar, R is
+    half its section's diagonal.
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
@@ -286,7 +286,7 @@ class Motion:
     waypoints: Float64
 
     def within(self, velocity_limit: Float64) -> "Motion":
-        """The same path, slowed where a joint would exceed its limit (J,) [rad/s]."""
+        """The same path, slowed as a whole if a joint would exceed its limit (J,) [rad/s]."""
         speeds = PEAK * np.abs(np.diff(self.waypoints, axis=0)) / np.diff(self.times)[:, None]
         slower = max(1.0, float(np.max(speeds / velocity_limit)))
         return replace(self, times=self.times + (slower - 1.0) * (self.times - self.times[0]))

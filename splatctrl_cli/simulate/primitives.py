@@ -79,7 +79,7 @@ def _hash(lattice: np.ndarray, seed: int) -> Float64:
 class Track:
     """Poses (K, 4, 4) at increasing stamps (K,) int64 [ns]; at rest outside.
 
-    In between, the origin moves linearly; the solid rotates about one axis, uniformly.
+    Between stamps, the origin moves linearly; the solid rotates about one axis, uniformly.
     """
 
     stamp_ns: Stamps
@@ -158,7 +158,7 @@ def box(name: str, size: tuple[float, ...], middle: Sequence[float], texture: Te
 
 
 def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64, Float64]:
-    """Signed distance (Q,) [m], negative inside, and surface point of points (Q, 3), world."""
+    """Signed distance (Q,) [m], negative inside, and nearest surface point (Q, 3) of points (Q, 3), world."""
     p = transform_points(invert_transform(primitive.T_world_shape), points_world)
     if primitive.kind == "sphere":
         surface = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-300) * primitive.size[0]

@@ -26,7 +26,7 @@ NOISES: dict[str, DepthNoise | StereoDepth | None] = {
     "realsense": DepthNoise(),
     "stereo": StereoDepth(width=WIDTH),
 }
-NUM_BALLS = 100  # that stand for a capsule of an unmodelled part: a millimetre apart
+NUM_BALLS = 100  # that replace a capsule of an unmodelled part, a millimetre apart
 OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
@@ -36,8 +36,8 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """Duration [s], frames per second per camera, image size [px], depth noise and seed.
 
-    with_person: a person with masks, instead of the cylinder. is_free: floor and walls alone. visitor: x, y, radius
-    [m] of the cylinder. color_rays: 0 to 4 per pixel, besides depth's.
+    with_person: a person with masks, instead of the cylinder. is_free: only floor and walls. visitor: x, y, radius
+    [m] of the cylinder. color_rays: 0 to 4 per pixel, plus one for depth.
     """
 
     duration_s: float = 7.0
@@ -78,9 +78,9 @@ class RecordingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Solids (`primitives`, ending with the `temporary`), an arm's motion, and cameras (none: the table's).
+    """Solids, an arm's motion, and cameras (none: the table's).
 
-    has_people: images mask temporary solids.
+    primitives: all solids, `temporary` ones last. has_people: images mask temporary solids.
     """
 
     primitives: tuple[Primitive, ...]
@@ -123,7 +123,7 @@ class Recording:
         scene: Scene | None = None,
         unmodelled: tuple[str, ...] = (),
     ) -> None:
-        """scene: instead of the options'; unmodelled: `UNMODELLED` parts on the arm."""
+        """scene: replaces that of `options`; unmodelled: `UNMODELLED` parts on the arm."""
         self.options, self.robot, self.unmodelled = options, robot, unmodelled
         parts = [(UNMODELLED[name][0], capsule) for name in unmodelled for capsule in UNMODELLED[name][1]]
         self._body = robot if not parts else _add_parts(robot, parts)
@@ -209,7 +209,7 @@ class Recording:
     def clearances(self) -> tuple[np.ndarray, Float64]:
         """Stamps (T,) int64 [ns] of joint states, and the arm's true clearance (T,) [m].
 
-        The least exact distance of moving collision spheres to the scene; unmodelled parts count to 1 mm.
+        It is the least exact distance of moving collision spheres to the scene; unmodelled parts count to 1 mm.
         """
         states = list(self.joint_states())
         moving, spheres = self._body.moving_spheres, self._body.sphere_set

@@ -1,6 +1,6 @@
 """Exact RGB-D images by ray casting: depth at pixel centres, colour from four rays.
 
-Two models of an active-stereo camera measure from exact depth.
+Two models of an active-stereo camera make measured depth of exact depth.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,12 +28,13 @@ class StereoDepth:
     A depth pixel is a pixel of the imagers.
 
     - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m
-      and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Steps are of 1/32 px.
+      and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Disparity steps are
+      1/32 px.
     - Next to an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
-      That width is uniform between the two numbers, constant within a window.
+      The width is uniform between the two numbers, and constant within a window.
     - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels
-      left of the foreground, less those that took its depth.
-    - A share `dropout` of all pixels is lost, in blobs twice as wide as the window; so are depths out of `least` to
+      left of the foreground, except those that took its depth.
+    - A share `dropout` of all pixels is lost, in blobs twice as wide as the window; so are depths outside `least` to
       `most` [m].
 
     width [px]: of the imagers, scaling their focal length; None: as wide as the image.
@@ -53,7 +54,7 @@ class StereoDepth:
         focal [px]: of the depth image; 0: of the imagers.
         """
         imager = FOCAL * (self.width or depth.shape[1]) / WIDTH
-        scale = focal / imager if focal > 0 else 1.0  # pixels of the image in one of the imagers
+        scale = focal / imager if focal > 0 else 1.0  # pixels of the image per pixel of the imagers
         exact = np.where(depth > 0, imager * BASELINE / np.where(depth > 0, depth, 1.0), 0.0)
         sigma = 0.5 * scale * self.window  # blurred noise correlates by exp(-(r / 2 sigma)^2)
         error, wide, offset, lost = (_blur(rng, depth.shape, sigma * blob) for blob in (1, 2, 2, 2))
@@ -97,7 +98,7 @@ class DepthNoise:
 
     spread [m]: sigma at 1 m, growing with depth squared. step [m]: quantisation at 1 m. patch [px]: matching window,
     over which errors agree. dropout: share of pixels lost, in patch-sized blobs. edge [m]: depth step that loses both
-    neighbours. max_range [m]: farther is lost. baseline [m]: of the imagers, to lose occluded depth (0: off).
+    neighbours. max_range [m]: farther depth is lost. baseline [m]: of the imagers, to lose occluded depth (0: off).
     """
 
     spread: float = 0.0012
@@ -151,7 +152,7 @@ FACES_AT_ONCE = 32_000  # of meshes: their numbers are 16 bits wide
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A fixed camera: T_world_camera (4, 4), optical frame; is_training False for scoring only."""
+    """A fixed camera: T_world_camera (4, 4), optical frame; is_training: False for scoring."""
 
     name: str
     intrinsics: Intrinsics
@@ -180,8 +181,8 @@ class Meshes:
 class Renderer:
     """Renderer of one camera; static solids are cast once.
 
-    Rays have unit length along the optical axis: t is depth [m]. `color_rays` rays give a pixel's colour (0: depth's
-    ray).
+    Rays have unit length along the optical axis, so t is depth [m]. `color_rays` rays give a pixel's colour (0: the
+    depth ray).
     """
 
     def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:
@@ -223,7 +224,7 @@ class Renderer:
                 color[mine] = shaded(primitive, origin + depth[mine][:, None] * self._directions[mine])
 
     def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> Index:
-        """Lower `depth` (K, H, W); index of the nearest primitive, or -1."""
+        """Lower `depth` (K, H, W) to primitives; return the nearest one's index, or -1."""
         origin = self.camera.T_world_camera[:3, 3]
         owner = np.full(depth.shape, -1)
         for index, primitive in enumerate(primitives):
@@ -236,7 +237,7 @@ class Renderer:
         return owner
 
     def _nearest_faces(self, meshes: Meshes | None, depth: Float64) -> Iterator[tuple[int, Bool, Integers]]:
-        """Lower `depth` (K, H, W); per ray, pixels of nearer triangles, and their numbers."""
+        """Lower `depth` (K, H, W) to triangles; yield, per ray, pixels of nearer triangles and their numbers."""
         if meshes is None:
             return
         k = self.camera.intrinsics

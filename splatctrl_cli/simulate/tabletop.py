@@ -75,7 +75,7 @@ def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primi
 
 
 def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
-    """The person along the table's near side, one solid per step."""
+    """A person who walks along the table's near side, one solid per step."""
     stamps = [from_ns + (to_ns - from_ns) * step // num_steps for step in range(num_steps + 1)]
     grape = texture("noise", 0.05, "grape", 2)
     places = [(0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20) for step in range(num_steps)]
@@ -144,7 +144,7 @@ def texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
 
 
 def turntable_views() -> Iterator[RgbdFrame]:
-    """Exact views from a 70-degree arc at two heights; the stamp is the number."""
+    """Exact views from a 70-degree arc at two heights; stamps are view numbers."""
     width, height = 256, 208  # [px]
     intrinsics = Intrinsics(
         fx=1.15 * width,

@@ -15,7 +15,7 @@ from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track,
 from splatctrl_cli.simulate.render import Camera
 
 FORMAT = "splatctrl-truth"
-VERSIONS = (1, 2)  # 2 has capsules and solids that move; a file is of the first that can hold it
+VERSIONS = (1, 2)  # 2 adds capsules and moving solids; a file has the lowest version that suffices
 NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 
 
@@ -24,7 +24,7 @@ class Truth:
     """Obstacles over time, cameras and robot of a simulated log; world, m, ns.
 
     clearance (T,) [m]: of moving collision spheres and `unmodelled` parts, at stamps (T,) int64 [ns] of joint states.
-    luminance_std: by camera, the least (0 to 1).
+    luminance_std: by camera, the least of its images (0 to 1).
     """
 
     path: Path
@@ -114,7 +114,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 
 def load_truth(path: Path) -> Truth:
-    """Read a truth file. Raises InputError for a missing, another or a damaged one."""
+    """Read a truth file. Raises InputError for a missing, foreign or damaged file."""
     with refuse_faults(f"{path}: not valid JSON", ValueError):
         document = json.loads(read_text(path, "give a truth.json"))
     is_ours = isinstance(document, dict) and document.get("format") == FORMAT
