@@ -86,7 +86,7 @@ def _refuse(path: Path, what: str) -> AbstractContextManager[None]:
 
 
 def read_states(path: Path) -> OccupancyGrid:
-    """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
+    """Read a grid of `write_states`. Raises InputError for other files; never unpickles."""
     with _refuse(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
@@ -95,9 +95,9 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read voxels' last views and lost edges alone.
+    """Read only voxels' last views and lost edges.
 
-    None if older. Raises InputError for another file.
+    None in an older file. Raises InputError for another kind.
     """
     with _refuse(path, _OURS):
         header = _read_header(path)
@@ -124,14 +124,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
+    """Read the grid of ``occupancy.npz``. Raises InputError for other files; never unpickles."""
     with _refuse(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
-    """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
+    """Read all of ``occupancy.npz``; None if older. Raises InputError for other files."""
     with _refuse(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -172,7 +172,7 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Array:
-    """`last_seen` in one byte or two; the largest numbers give reasons for never."""
+    """Check `last_seen` of one byte or two; its largest numbers are reasons for never."""
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
     is_old = "unseen" not in header  # then only the largest number is no time step, and means `UNANSWERED`
