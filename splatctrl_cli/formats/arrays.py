@@ -52,8 +52,8 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, Values]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or a size other than
-    announced, and `DAMAGE`.
+    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or a wrong size, and
+    `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         chosen = (
@@ -77,7 +77,7 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read a ``.npy`` header, no further: shape, is_by_columns, dtype. Raises ValueError without one."""
+    """Read only a ``.npy`` header: shape, is_by_columns, dtype. Raises ValueError without one."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, is_fortran, dtype = read(stream)

@@ -1,6 +1,6 @@
 """Image files: heads of JPEG and PNG without decoding, pixels, portable float maps.
 
-PFM has one float32 channel, as MVSNet's depth, with rows from the bottom.
+PFM: one float32 channel, as MVSNet's depth, rows from the bottom.
 """
 
 import re
@@ -41,8 +41,8 @@ class ImageHead:
 def image_head(data: bytes) -> ImageHead | None:
     """Read the head of a whole, plain JPEG or PNG; None for others.
 
-    Plain are a Huffman-coded 8-bit JPEG of one or three channels, with its end, and a grey or RGB PNG without
-    transparency or interlace, all checksums right (ITU-T T.81; W3C PNG).
+    Plain: Huffman-coded 8-bit JPEG of one or three channels, with its end; grey or RGB PNG without transparency or
+    interlace, all checksums right (ITU-T T.81; W3C PNG).
     """
     head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
     return None if head is None or not 0 < head.width * head.height <= MOST_PIXELS else head
@@ -104,7 +104,7 @@ def _png_head(data: bytes) -> ImageHead | None:
 def decode_file(data: bytes, *, color: bool) -> Array | None:
     """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
-    color: convert to 8-bit RGB; else as OpenCV reads it, colours in BGR.
+    color: 8-bit RGB; else as OpenCV reads it, in BGR.
     """
     if (
         not data

@@ -126,8 +126,8 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Comments follow the properties, as some readers need. Non-ASCII text is escaped. Raises UsageError for a comment
-    of several lines, or a key with a colon.
+    Comments follow the properties, for some readers. Non-ASCII text is escaped. Raises UsageError for a comment of
+    several lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -247,7 +247,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """True for a PLY with faces, and for any file that is no PLY."""
+    """True for a PLY with faces, or for no PLY."""
     if path.suffix.lower() != ".ply":
         return True
     header = read_bytes(path, 65536).partition(b"end_header")[0]
@@ -264,8 +264,8 @@ _Line = tuple[int, list[str]]
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """Yield a CSV's points as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
 
-    If the first line is three numbers, there is no header. Else the header names x, y, z; other columns are ignored.
-    Raises InputError for a missing column, a line of another length, or no finite number within `MAX_PLACE`.
+    A first line of three numbers is no header. Else the header names x, y, z; other columns are ignored. Raises
+    InputError for a missing column, a line of another length, or no finite number within `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)

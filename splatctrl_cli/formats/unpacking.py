@@ -1,4 +1,4 @@
-"""File reads, and bounded decompression to no more than announced."""
+"""File reads, and decompression to no more than announced."""
 
 import bz2
 import tomllib

@@ -160,8 +160,8 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class ChangedSource(FrameSource):
     """Another source's records, corrected by a calibration or perturbed, in memory.
 
-    A calibrated clock shifts the stamps of joint states. The pose of a moving camera is then taken at the frame's
-    time on the robot's clock. Frames without a pose within `tolerance_ns` are left out and counted.
+    A calibrated clock shifts joint states. A moving camera's pose is then that of the frame's time on the robot's
+    clock. Frames without a pose within `tolerance_ns` are left out and counted.
     """
 
     def __init__(self, source: FrameSource, change: "Correction | Perturbation", tolerance_ns: int) -> None:
@@ -268,7 +268,7 @@ class Perturbation:
         return perturbation if perturbation.depth_noise or perturbation.pose_error or perturbation.pose_turn else None
 
     def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
-        """Add noise to depth (H, W) [m]; no return stays 0, and negative depth becomes 0."""
+        """Add noise to depth (H, W) [m]; no return stays 0, negative depth becomes 0."""
         noise = self._generator(camera, stamp_ns).standard_normal(depth.shape, np.float32)
         noisy = depth + np.float32(self.depth_noise) * depth**2 * noise
         return np.where((depth > 0) & (noisy > 0), noisy, np.float32(0.0)).astype(np.float32)

@@ -74,7 +74,7 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
     """Open one input, or several logs recorded at the same time.
 
-    Raises InputError as `open_source` does, and if one of several inputs is no log.
+    Raises InputError as `open_source`, and if one of several is no log.
     """
     log = open_logs(paths)
     options = options or SourceOptions()
@@ -82,7 +82,7 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
-    """Triples (path, topic or node, text) of logs' and captures' URDFs, each text once."""
+    """Triples (path, topic or node, text) of logs' and captures' URDFs, each once."""
     by_text: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
         descriptions = []
@@ -97,7 +97,7 @@ def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
-    """Open a log, or several of one session; None for another kind of input.
+    """Open a log, or several of one session; None for another kind.
 
     Raises InputError if missing, or if one of several is no log.
     """
@@ -135,7 +135,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
-    """Describe topics, times, frames, cameras, and inputs that a reconstruction lacks."""
+    """Describe topics, times, frames, cameras, and what a reconstruction lacks."""
     survey, sampling = survey_to_describe(log)
     logged = [t for t in survey.topics.values() if t.count]
     first, last = min((t.first_log_ns for t in logged), default=0), max((t.last_log_ns for t in logged), default=0)

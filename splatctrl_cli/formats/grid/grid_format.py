@@ -151,10 +151,11 @@ def x_fastest(values: Values) -> Iterator[Values]:
 class GridFormat:
     """A file format, in its module's ``ENTRIES``.
 
-    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
-    `describe`: from a path and its first bytes; None for another kind. `needs`: at least one of these channels.
-    `holds_unknown`: it stores cells without a distance. `bytes_per_cell`: on disk, None for the sum of all channels.
-    `check` raises UsageError without its library. `docs`: row in docs/artefacts.md: name | file | who opens it.
+    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`;
+    InputError for invalid channels. `describe`: from a path and its first bytes; None for another kind. `needs`: at
+    least one of these channels. `holds_unknown`: stores cells without a distance. `bytes_per_cell`: on disk, None for
+    the sum of all channels. `check` raises UsageError without its library. `docs`: row in docs/artefacts.md: name |
+    file | who opens it.
     """
 
     name: str
@@ -270,7 +271,7 @@ class GridSlabs:
         return self.num_layers == self.plan.shape[0]
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
-        """Open as read-only memory maps. Raises InputError before it is whole."""
+        """Open as read-only memory maps. Raises InputError before the grid is whole."""
         refuse_if(
             not self.is_whole(),
             f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",

@@ -14,7 +14,7 @@ FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__pa
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
     """Raise UsageError if `write_grid` would fail for `names`.
 
-    unknown: the policy for unknown space; ``nan`` leaves cells without a distance.
+    unknown: the policy; ``nan`` leaves cells without a distance.
     """
     strange = [name for name in names if name not in FORMATS]
     refuse_if(

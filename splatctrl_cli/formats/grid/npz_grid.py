@@ -36,7 +36,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid. Raises InputError for invalid channels."""
+    """Write the grid."""
     check_grid(grid)
     members: dict[str, Values] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),

@@ -39,7 +39,7 @@ _REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
 
 
 def write_vti(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid; NaN is kept. Raises InputError for invalid channels."""
+    """Write the grid; NaN is kept."""
     x, y, z = check_grid(grid)
     extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
     origin, spacing = (" ".join(repr(float(v)) for v in values) for values in (grid.origin, [grid.voxel] * 3))

@@ -55,7 +55,7 @@ class Snapshot:
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
-        """The grid, as coarse as `write_states`; None in an older scene."""
+        """The grid of `write_states`, without log-odds; None in an older scene."""
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
@@ -214,7 +214,7 @@ class SceneFolder:
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for 3D Gaussian splatting, which has `gaussians` but no splats or occupancy."""
+        """True for 3D Gaussian splatting: it has `gaussians`, no splats or occupancy."""
         return self._metric("method", "3dgs".__eq__, "")
 
     def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:

@@ -86,7 +86,7 @@ def _refuse(path: Path, what: str) -> AbstractContextManager[None]:
 
 
 def read_states(path: Path) -> OccupancyGrid:
-    """Read a grid of `write_states`. Raises InputError for other files; never unpickles."""
+    """Read a `write_states` grid. Raises InputError otherwise; never unpickles."""
     with _refuse(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         header = json.loads(str(arrays["header"]))
@@ -97,7 +97,7 @@ def read_states(path: Path) -> OccupancyGrid:
 def read_seen(path: Path) -> SeenVoxels | None:
     """Read only voxels' last views and lost edges.
 
-    None in an older file. Raises InputError for another kind.
+    None if older. Raises InputError for another file.
     """
     with _refuse(path, _OURS):
         header = _read_header(path)
@@ -124,14 +124,14 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read the grid of ``occupancy.npz``. Raises InputError for other files; never unpickles."""
+    """Read the ``occupancy.npz`` grid. Raises InputError otherwise; never unpickles."""
     with _refuse(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
-    """Read all of ``occupancy.npz``; None if older. Raises InputError for other files."""
+    """Read all of ``occupancy.npz``; None if older. Raises InputError otherwise."""
     with _refuse(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:

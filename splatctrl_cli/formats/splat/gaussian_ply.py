@@ -134,9 +134,9 @@ def _angles(a: Float32, b: Float32) -> Float64:
 class SplatFormat:
     """A splat file format, in its module's ``ENTRIES``.
 
-    `reduce`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
-    library. `docs`: rows in docs/artefacts.md, an empty line between: suffix | what it is | what it rounds to | what
-    it cannot represent.
+    `write`: same input, same bytes; InputError for an invalid value. `reduce`: the representable part of a set;
+    `bound`: the largest rounding; `check` raises UsageError without its library. `docs`: rows in docs/artefacts.md,
+    an empty line between: suffix | what it is | what it rounds to | what it cannot represent.
     """
 
     name: str
@@ -175,10 +175,10 @@ HEADER_COMMENTS = {
 
 
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
+    """Write `gaussians`, with frame, units and `comments` in the header.
 
-    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError for an invalid
-    value, UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises UsageError for a comment of
+    several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -240,7 +240,7 @@ def exact_centers(ply: PlyFile) -> Float64:
 def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
     """Centres (N, 3) float32 [m]. Raises InputError if rounding moves splats too far.
 
-    The limit follows from `sigmas` (N,) or (N, 3) [m] and the length of the centres' box.
+    The limit follows from `sigmas` (N,) or (N, 3) [m] and their box's length.
     """
     exact = exact_centers(ply)
     centers = exact.astype(np.float32)

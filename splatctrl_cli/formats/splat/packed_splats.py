@@ -40,10 +40,9 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 
 
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
+    """Write what `.splat` can represent of `gaussians`, without `comments`.
 
-    A quaternion's largest component is made negative, as a byte can be -1 but not 1. Raises InputError for an invalid
-    value.
+    A quaternion's largest component is made negative, as a byte can be -1 but not 1.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -104,10 +103,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 
 
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
-
-    Raises InputError for an invalid value.
-    """
+    """Write what `.spz` can represent of `gaussians`, without `comments`."""
     check_gaussians("Gaussians to write", gaussians)
     clipped, bits = reduce_to_spz(gaussians), _fraction_bits(gaussians.centers)
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[clipped.harmonics.shape[1]]
@@ -160,8 +156,8 @@ def reduce_to_spz(gaussians: GaussianSet) -> GaussianSet:
 def spz_bound(gaussians: GaussianSet) -> Differences:
     """Half a step of each value, with a margin for float32.
 
-    Sigma: a factor exp(1/32). Rotation: half a step of sqrt(1/2) / 511 in three components is 1.2e-3 together. The
-    fourth component doubles this, and the angle doubles it again: 0.28 degrees.
+    Sigma: a factor exp(1/32). Rotation: half a step of sqrt(1/2) / 511 in three components is 1.2e-3; the fourth
+    doubles this, and the angle again: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),

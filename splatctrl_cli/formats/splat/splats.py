@@ -100,7 +100,7 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 
 
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
-    """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
+    """Write `splats`, with frame, units and `comments` in the header.
 
     Opacities 0 and 1 read back exactly. Raises InputError for an invalid value, UsageError for a comment of several
     lines.
@@ -124,7 +124,7 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
 def read_world_splats(path: Path) -> SplatSet:
     """Read a PLY whose comments name metres and world, or neither.
 
-    Raises InputError as `read_ply`, and for another unit or frame, or a shell.
+    Raises InputError as `read_ply` and `check_world`.
     """
     splats, comments = read_ply(path)
     check_world(path, comments)

@@ -27,8 +27,7 @@ NAME = "field"  # of a temporary file: the library goes by the suffix
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError for an invalid value, UsageError
-    without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()
@@ -64,7 +63,7 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 
 
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
-    """Read a USD file's only particle field, in its own axes, and its custom data.
+    """Read a USD file's only particle field, and its custom data.
 
     Transforms are not applied. Raises InputError if unreadable or without exactly one field, UsageError without the
     library.

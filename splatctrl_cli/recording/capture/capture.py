@@ -216,8 +216,7 @@ _NOT_FOR_CAPTURES = (
 class CaptureSource(FrameSource):
     """Records of a capture; files with a wrong checksum are damage.
 
-    joints: a robot's, whose states are merged from the capture's joint topics. Without `joints`, or such topics, the
-    states are those of joints.npz.
+    joints: a robot's, merged from the capture's joint topics. Without either, states are those of joints.npz.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:

@@ -50,7 +50,7 @@ class Journal:
     """A partial folder's journal: an earlier run's entries, then new ones."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """identity: facts that decide the capture's bytes, compared when a run resumes."""
+        """identity: facts that decide the bytes, compared when a run resumes."""
         self.path = folder / JOURNAL
         self.num_entries = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -112,11 +112,10 @@ def write_capture(
 ) -> tuple[dict[str, Any], int]:
     """Write all of `source` into `folder`, empty or of an interrupted run.
 
-    A colour JPEG or PNG with exactly the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its
-    recorded unit, or .npy [m] if counts would not restore it. topics: all joint states as recorded; `source` has
-    those of one topic. robot: the log's URDF, or "". Returns run.json's frames by camera, joint_states and loss, and
-    the number of frames that an earlier run wrote. Raises InputError if no frame could be read, UsageError if an
-    earlier frame differs.
+    JPEG or PNG colour with exactly the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded
+    unit, or .npy [m] if counts would not restore it. topics: all joint states as recorded; `source` has those of one
+    topic. robot: the log's URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the
+    number of earlier frames. Raises InputError without a frame, UsageError if earlier frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}

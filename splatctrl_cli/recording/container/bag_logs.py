@@ -1,7 +1,7 @@
 """The messages of ROS 1 and ROS 2 (sqlite3) bags; damage is skipped and counted.
 
-A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. rosbag2_storage_sqlite3
-has tables topics and messages, since Iron also message_definitions. The rosbags package refuses a damaged file.
+A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. Tables of
+rosbag2_storage_sqlite3 are topics, messages and, since Iron, message_definitions. rosbags refuses a damaged file.
 """
 
 import os
@@ -243,8 +243,8 @@ _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite
 class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so file and journal are copied, a cut file up to its last whole page.
-    Raises InputError for other tables, or an unreadable file.
+    SQLite writes while it reads a journal, so both files are copied, a cut one up to its last whole page. Raises
+    InputError for other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"

@@ -1,9 +1,8 @@
 """Foxglove's schemas, and the RealSense SDK's texts, as the ROS messages they stand for.
 
-Foxglove's messages are JSON, ROS twins, or protobuf, which the log's FileDescriptorSet describes. Their fields are in
-docs.foxglove.dev ("Schemas"). JSON has times as {sec, nsec} and bytes as base64; protobuf has times as
-google.protobuf.Timestamp. The SDK's .db3 has intrinsics, extrinsics and depth units as std_msgs/String (librealsense,
-src/media/ros2/ros2_writer.cpp).
+Foxglove's messages are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet. Fields: docs.foxglove.dev
+("Schemas"). JSON times are {sec, nsec} and bytes base64; protobuf times are google.protobuf.Timestamp. The SDK's .db3
+has intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
 """
 
 import base64

@@ -1,8 +1,8 @@
 """The records of an MCAP file from front to back, despite damage, in bounded memory.
 
-Reading skips an impossible record, up to the next place in the summary or the next compressed chunk with consistent
-lengths. The `mcap` package reads a record's fields (mcap.dev/spec); bytes after the last field are allowed, as
-specified.
+After an impossible record, reading continues at the summary's next place, or the next compressed chunk with
+consistent lengths. The `mcap` package reads a record's fields (mcap.dev/spec); bytes after the last field are
+allowed.
 """
 
 import bisect
@@ -32,7 +32,7 @@ HEAD = struct.Struct("<BQ")  # opcode and length of what follows
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
     def read(self, length: int) -> bytes:
-        """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
+        """Read exactly `length` bytes. Raises EndOfFile where the package returns fewer."""
         content: bytes = super().read(length)
         if len(content) < length:
             raise EndOfFile

@@ -88,7 +88,7 @@ class Damage:
 class RawLog:
     """A log that can be read repeatedly.
 
-    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``. channels: declared topics by number.
+    container: the kind of file, such as ``MCAP`` or ``ROS 1 bag``. channels: declared topics by number.
     """
 
     path: Path

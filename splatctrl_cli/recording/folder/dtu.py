@@ -46,7 +46,7 @@ Shrink = Callable[[DtuView], DtuView]
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """A scan's views, their numbers, files read, and names of images without_depth."""
+    """A scan's views, their numbers, files read, and names without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
@@ -222,7 +222,7 @@ def read_image(path: Path) -> UInt8:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
-    """Mask (H, W), True where bright in every channel, resized by nearest pixels."""
+    """Mask (H, W), True where bright in every channel, by nearest pixels."""
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
@@ -271,7 +271,7 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
 
 
 def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
-    """Fit K, which is for one of the common sizes, to an image of `size` (width, height).
+    """Fit K, of one of the common sizes, to an image of `size` (width, height).
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves u to (u + 0.5) scale -
     0.5, as in `shrink_view`. MVSNet's K for 640x512, and for a quarter, are multiples of that for 1600x1200, without

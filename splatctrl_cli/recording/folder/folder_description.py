@@ -96,7 +96,7 @@ class SplitTable:
 class ImagePart:
     """An image inside a file, used like an image file's path.
 
-    number: the image's index. size: (columns, rows). read_bytes: returns an image file of `suffix`, empty if damaged.
+    number: its index. size: (columns, rows). read_bytes: returns an image file of `suffix`, empty if damaged.
     """
 
     file: Path
@@ -125,8 +125,8 @@ def whole_file(image: ImageFile) -> Path:
 class ListedView:
     """A view by its files, for layouts that list them.
 
-    depth: None if no view has any. matrix: pose as written, or None. camera: None for that of [camera]. depth_scale:
-    metres per count, None for that of [depth]. valid: 8-bit grey, 0 on invalid pixels, or None.
+    depth: None if no view has any. matrix: pose as written, or None. camera: None for [camera]'s. depth_scale: metres
+    per count, None for [depth]'s. valid: 8-bit grey, 0 on invalid pixels, or None.
     """
 
     name: str
@@ -142,7 +142,7 @@ class ListedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
+    """A description; transforms.json may give camera and frames, --camera-pose the poses.
 
     listed: a layout's views, instead of frames. is_depth_resized: to colour, by nearest pixels. unpaired: colour and
     depth files without partner. num_damaged: views lost to damage. supply: how to add depth if no view has it. notes:
@@ -196,7 +196,7 @@ def read_table(
 ) -> T:
     """Read table [name] of a TOML file; `fill` adds keys left out.
 
-    Raises InputError naming an unknown, missing or wrong key.
+    Raises InputError for a wrong key.
     """
     content = _content(path)
     _check_keys(content, {name, *others}, str(path), "")
@@ -211,10 +211,10 @@ def has_table(path: Path, name: str) -> bool:
 
 
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
-    """A description for each table ``[[cameras]]``; empty without any.
+    """A description per ``[[cameras]]`` table; empty without any.
 
-    Its keys are those of [camera], and `color`, `depth`, `poses` for files; other tables are common. Raises
-    InputError for a wrong key, and a shared or missing name.
+    Keys are those of [camera], and `color`, `depth`, `poses` for files; other tables are common. Raises InputError
+    for a wrong key, and a shared or missing name.
     """
     content = _content(path)
     cameras = content.pop("cameras", [])

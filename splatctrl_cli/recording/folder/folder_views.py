@@ -37,8 +37,7 @@ UNITS = {MILLIMETRE: "millimetres", 0.01: "centimetres"}  # [m] of each, the lik
 class View:
     """A pair of files with an optional mask; name is the text of `*`.
 
-    camera: its name, or HOLDOUT. lens: the camera that took the view. depth_scale: metres per count. valid: mask of
-    usable pixels.
+    camera: its name, or HOLDOUT. lens: its camera. depth_scale: metres per count. valid: mask of usable pixels.
     """
 
     name: str

@@ -1,10 +1,9 @@
 """DTU scans in the layout of IDR and NeuS; scans as training and held-out records.
 
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
-and scale_mat_I, from the object's unit sphere to the world. Further files are SCAN/image/000000.png and
-SCAN/mask/000.png. Image I is the I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing.
-Lengths are millimetres in files, metres in memory. SCAN/depth may have depth_map_0000.pfm (and depth_visual_0000.png)
-as MVSNet names them.
+and scale_mat_I, from the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the
+I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. Lengths are millimetres in files,
+metres in memory. SCAN/depth may have depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
 """
 
 import re
@@ -80,7 +79,7 @@ def read_idr(
 
 
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
-    """Write views as one scan folder, with their masks; return the folder.
+    """Write views and masks as one scan folder; return it.
 
     The object's sphere is centred nearest to the cameras' axes; its radius is half the nearest camera's distance.
     """

@@ -34,8 +34,8 @@ _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 class Layout:
     """A dataset layout, in its module's ``ENTRIES``.
 
-    order: the lowest of those that match is used. suffix: that of a file which is a dataset by itself. docs: rows of
-    docs/input.md with cells between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
+    order: the lowest that matches is used. suffix: of a file that is a dataset by itself. docs: rows of
+    docs/input.md, cells between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
     """
 
     name: str
@@ -71,7 +71,7 @@ def ask_description(name: str, *examples: str) -> Callable[[Path, SourceOptions]
 def add_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> CameraTable:
     """The known camera equal to `table`, else `table`, added as ``camera``, ``camera-1``, ...
 
-    Raises InputError for an impossible size or focal length.
+    Raises InputError if it is impossible.
     """
     for known in lenses:
         if asdict(replace(known, name=table.name)) == asdict(table):

@@ -5,16 +5,15 @@ by video and seconds; depth is in millimetres; an image's ``.pincam`` has width,
 lines are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes,
 DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
 
-BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``. Each image has cam_K by rows [px], depth_scale
-(counts to millimetres), cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit,
-docs/bop_datasets_format.md). Images are PNG, JPEG or TIFF. Several sensors have ``scene_camera_cam1.json``,
-``rgb_cam1/``, ``depth_cam1/``.
+BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``, in PNG, JPEG or TIFF. Per image: cam_K by rows [px],
+depth_scale (counts to millimetres), cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit,
+docs/bop_datasets_format.md). Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
 
 MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, optional depth (.pfm). A camera file is the world-to-camera
 matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (README, "File Formats") or ``DEPTH_MIN
-DEPTH_MAX``. Images are in ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py),
-``blended_images/`` (BlendedMVS) or next to ``cams/``. Depth has the cameras' unknown unit; it is in
-``rendered_depth_maps/`` (BlendedMVS) or any folder with ``depth`` in its name.
+DEPTH_MAX``. Images: ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py), ``blended_images/``
+(BlendedMVS) or next to ``cams/``. Depth, in the cameras' unknown unit: ``rendered_depth_maps/`` (BlendedMVS) or any
+folder with ``depth`` in its name.
 """
 
 import re

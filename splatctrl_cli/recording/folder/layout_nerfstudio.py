@@ -1,6 +1,6 @@
 """nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose per frame.
 
-Fields, defaults and axes (OpenGL) are those of nerfstudio's documentation ("Data conventions"),
+Fields, defaults and axes (OpenGL): nerfstudio's documentation ("Data conventions"),
 nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py. Masks are 0 on invalid pixels;
 depth of another size is resized by nearest pixels; ``applied_scale`` is undone. instant-ngp has ``depth_path``,
 ``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; its default principal point is the image's

@@ -1,8 +1,8 @@
 """Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
 Format: PCL's tutorial "The PCD file format" (v0.7), read by pypcd4 (extra `pcd`). Intrinsics follow from the grid:
-the point of row v, column u is on the ray of pixel (u, v). VIEWPOINT is the camera's pose. Points are in the frame of
-the camera (z forward) or the world, whichever fits.
+the point of column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in camera (z forward)
+or world coordinates, whichever fits.
 """
 
 import struct

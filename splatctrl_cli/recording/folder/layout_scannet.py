@@ -1,10 +1,10 @@
 """ScanNet's sensor files: ``X.sens`` of version 4, alone or in its folder.
 
-The layout is that of ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian. The head has
-version (uint32), name (uint64 and text), and four 4x4 float32 matrices (intrinsics and extrinsics of colour, then
-depth). Storage of colour and depth (two int32), their sizes (four uint32), counts per metre (float32) and number of
-frames (uint64) follow. A frame has camera to world (16 float32, -inf if lost), stamps of colour and depth [us] and
-lengths of both images (four uint64), and the images. IMU data follows, and is skipped.
+Layout of ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name
+(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth); storage of colour and
+depth (two int32), their sizes (four uint32), counts per metre (float32), number of frames (uint64). A frame: camera
+to world (16 float32, -inf if lost), stamps of colour and depth [us] and lengths of both images (four uint64), the
+images. IMU data follows, and is skipped.
 """
 
 import struct

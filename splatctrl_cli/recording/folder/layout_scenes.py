@@ -1,7 +1,7 @@
 """Room scenes with a trajectory or a pose per frame: 7-Scenes, Open3D, Redwood, Replica.
 
 7-Scenes and its kin: ``frame-NNNNNN.color.*``, ``.depth.*``, ``.pose.txt``, in one folder, ``seq-NN/``, ``data/``.
-Depth is in millimetres, 65535 = none; poses are camera to world. There are three calibrations:
+Depth is in millimetres, 65535 = none; poses are camera to world. Three calibrations:
 
 - ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan): the user describes the folder;
 - ``camera-intrinsics.txt``, one 3x3 matrix for colour and depth (3DMatch, Zeng et al., CVPR 2017);

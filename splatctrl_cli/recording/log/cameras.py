@@ -1,7 +1,7 @@
 """A log's RGB-D cameras, and their poses from messages instead of tf.
 
-Poses are read from nav_msgs/Odometry (pose of child_frame_id in header.frame_id), geometry_msgs/PoseStamped,
-PoseWithCovarianceStamped and TransformStamped.
+Poses: nav_msgs/Odometry (of child_frame_id in header.frame_id), geometry_msgs/PoseStamped, PoseWithCovarianceStamped
+and TransformStamped.
 """
 
 import re
@@ -42,7 +42,7 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
     """Topics whose first image is of `kind`: color, depth, other or ``unlike``.
 
-    ``unlike``: the topic's name contradicts the image, as for 16-bit infrared.
+    ``unlike``: the name contradicts the image, as for 16-bit infrared.
     """
     topics = [(t, t.first_image) for t in survey.select_types(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
@@ -162,7 +162,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """Frame of the colour images; a video file without one takes its depth's."""
+    """Frame of the colour images; a video file's is its depth's."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
@@ -312,9 +312,9 @@ def join_pose_topics(
 ) -> None:
     """Add poses from topics to a survey's tf tree.
 
-    The options name topics by camera. Without them, an odometry is used, with a note, if its child is a camera's
-    frame that tf misses, or its parent is the world frame that tf misses. only_first: one pose, enough to see
-    connections. Raises InputError if a topic cannot place its camera, or several odometries place one frame.
+    Options name topics by camera. Without these, an odometry is used, with a note, if tf misses its child, a camera's
+    frame, or its parent, the world frame. only_first: one pose, enough to see connections. Raises InputError if a
+    topic cannot place its camera, or several odometries place one frame.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     by_camera = {name: pose_topic for name, pose_topic in options.camera_pose_topics.items() if name in frames}

@@ -63,7 +63,7 @@ def is_foxglove(topic: Topic) -> bool:
 
 
 class MessageDecoder:
-    """A decoder with type definitions by topic: an unusable definition affects no other topic."""
+    """A decoder with type definitions by topic: an unusable one affects no other topic."""
 
     def __init__(self) -> None:
         self._stores: dict[Topic, Any] = {}
@@ -113,7 +113,7 @@ def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
     The stamp's two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Raises
-    UndecodableMessageError if a message is too short.
+    UndecodableMessageError if too short.
     """
     if message.topic.schema == TEXT:
         return message.log_time_ns
@@ -272,7 +272,7 @@ def device_of(topic: str) -> str:
 
 
 def _unit(value: float, topic: str) -> float:
-    """Metres per count, to six digits: 0.001 was written as a float32."""
+    """Metres per count, to six digits (0.001 was a float32)."""
     unit = float(f"{float(value):.6g}")
     refuse_if(not 0 < unit < 1, f"{topic}: expected metres per count, got {unit}", error=ValueError)
     return unit

@@ -235,7 +235,7 @@ def _decode(packed: _Packed, *, color: bool) -> NDArray[Any]:
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
     """Convert `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
-    With 16 bits a channel, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp).
+    In 16-bit channels, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp).
     """
     code = COLOR_CONVERSIONS[encoding]
     converted = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
@@ -247,7 +247,7 @@ def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
 def raw_pixels(message: Any) -> NDArray[Any]:
     """Pixels (H, W[, channels]) of a sensor_msgs/Image; zero channels for an unknown encoding.
 
-    Skips row padding; reads either byte order. Raises UndecodableMessageError for too few data or an impossible size.
+    Skips row padding; reads either byte order. Raises UndecodableMessageError for too few data or a wrong size.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
@@ -355,7 +355,8 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
 def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
     """Decode compressed_depth_image_transport (its codec.cpp and rvl_codec.cpp).
 
-    A PNG follows 12 bytes (int32, float32 A and B), or width and height (int32) and RVL. 32FC1 is A / (count - B).
+    After 12 bytes (int32, float32 A and B) comes a PNG, or width and height (int32) and RVL. 32FC1 depth is A /
+    (count - B).
     """
     counts = _rvl_counts(packed.file) if packed.is_rvl else decode_file(packed.file, color=False)
     if counts is None or counts.ndim != 2:
@@ -384,10 +385,9 @@ def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
-    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017. Runs of zeros and of values alternate. A value is
-    the zigzag-coded difference from the last nonzero pixel. A number is a row of nibbles: three of its bits each,
-    lowest first, and a high bit if another follows. Nibbles fill 32-bit words from the top. Raises ValueError if
-    invalid.
+    A. D. Wilson, ISS 2017 (RVL). Runs of zeros and of values alternate. A value is the zigzag-coded difference from
+    the last nonzero pixel. Numbers are nibbles of three bits, lowest first, with a high bit if another follows.
+    Nibbles fill 32-bit words from the top. Raises ValueError if invalid.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length
@@ -455,8 +455,7 @@ _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, wh
 def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
     """Image kind, such as "depth" or "infra", that a topic names; "" if none.
 
-    The last part that names a kind decides; of ``a_to_b``, only ``a`` counts. is_device: parts such as
-    ``depth_camera`` count too.
+    The last part with a kind counts; of ``a_to_b``, only ``a``. is_device: parts such as ``depth_camera`` count too.
     """
     for part in reversed(parts):
         words = re.findall("[a-z]+", part.lower())

@@ -217,9 +217,8 @@ class Lens:
     """Corrections of a camera's images.
 
     intrinsics: of the corrected image. maps (H, W): column and row in the recorded image by pixel, None if images
-    stay as recorded. valid (H, W): False where the lens saw nothing, None if it saw every pixel. Invalid pixels have
-    black colour, depth 0 and label 0. depth_lens, T_color_depth (4, 4): of a separate depth camera, None if depth is
-    on colour's pixels.
+    stay as recorded. valid (H, W): False where the lens saw nothing (colour is black, depth and labels 0), None if it
+    saw all. depth_lens, T_color_depth (4, 4): of depth's own camera, None for depth on colour's pixels.
     """
 
     intrinsics: Intrinsics
@@ -246,8 +245,8 @@ class Lens:
 def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:
     """Warp depth (H', W') [m] of camera `own` to colour camera `target`, (H, W) [m], 0 = none.
 
-    Each depth pixel fills its square as `target` sees it, so that finer colour pixels get no holes. Where squares
-    overlap, the nearest depth counts.
+    Each depth pixel fills its square as `target` sees it, so that finer colour pixels get no holes; the nearest depth
+    counts.
     """
     x, y, z = transform_points(T_color_depth, back_project(own, depth)[depth > 0]).T
     front = z > 0
@@ -278,8 +277,7 @@ def undistort_lens(
 ) -> Lens:
     """A lens without its distortion, shown with intrinsics `result`. Raises InputError for an impossible lens.
 
-    recorded: intrinsics of the distorted image, by default `result`. R (3, 3): rotates the lens's axes to the
-    result's.
+    recorded: intrinsics of the distorted image, by default `result`. R (3, 3): the lens's axes to the result's.
     """
     R = np.eye(3) if R is None else R
     counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
@@ -334,8 +332,8 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
     """A lens's corrections; a pinhole has none but the mask `valid`.
 
-    Focal lengths stay; those of an equidistant lens shrink to show its whole width and height, up to `WIDEST_RAY`.
-    Raises InputError for an impossible lens.
+    Focal lengths stay; an equidistant lens's shrink to show its whole image, up to `WIDEST_RAY`. Raises InputError
+    for an impossible lens.
     """
     if not is_distorted(model, coefficients):
         return Lens(intrinsics=lens, valid=valid)

@@ -46,8 +46,8 @@ _RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the nam
 class Camera(Lens):
     """An RGB-D camera of a log.
 
-    fixed_pose: the user's T_world_camera. human_topic: topic of its human masks. depth_scale [m per count]: the
-    user's or the log's.
+    fixed_pose: the user's T_world_camera. human_topic: of its masks. depth_scale [m per count]: the user's or the
+    log's.
     """
 
     name: str

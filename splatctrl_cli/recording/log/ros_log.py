@@ -1,7 +1,7 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
-The first pass skips images, as transforms may follow them, and plans every frame. The second reads the planned images
-in plan order. For `ingest`, files that a capture can keep stay undecoded.
+The first pass skips images, as transforms may follow them, and plans every frame. The second reads planned images in
+plan order. For `ingest`, files that a capture can keep stay undecoded.
 """
 
 import tempfile
@@ -89,10 +89,7 @@ class FramePlan:
         masks: Mapping[int, int],
         poses: Iterable[Float64 | None],
     ) -> int:
-        """Add those of K frames that have a pose (4, 4); return their number.
-
-        masks: mask number by colour number.
-        """
+        """Add the frames with a pose (4, 4), masks by colour number; return their number."""
         first = len(self._poses)
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
@@ -135,10 +132,7 @@ Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Messages that wait for the rest of their frame, beyond `HELD_BYTES` on disk.
-
-    If a log stores topics apart, half of it may wait.
-    """
+    """Messages that wait for others of their frame: half of a log with topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}
@@ -181,7 +175,7 @@ def planned_images(
 ) -> Iterator[tuple[PlannedFrame, list[RawMessage]]]:
     """Yield frames in plan order with colour, depth and mask messages.
 
-    `waiting` stores the messages of later frames. Frames that stay incomplete count as `damage`.
+    `waiting` stores messages of later frames; frames that stay incomplete are `damage`.
     """
     uses, position, num = plan.uses(), 0, len(plan)
     numbers, planned = dict.fromkeys(uses, 0), plan[0]
@@ -360,9 +354,9 @@ class RosLogSource(FrameSource):
 def _images(
     decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
 ) -> list[ImageMessage]:
-    """Colour, depth and mask; is_whole: decode also files that a capture can keep.
+    """Colour, depth and mask; is_whole: decode even what a capture can keep.
 
-    Raises UndecodableMessageError, also for another size.
+    Raises UndecodableMessageError.
     """
     is_lazy = camera.maps is None and not is_whole
     images = [

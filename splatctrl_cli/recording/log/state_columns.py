@@ -19,8 +19,8 @@ COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 class StateColumns(Sequence[JointState]):
     """T states by stamp: stamp_ns (T,); position, velocity (T, J).
 
-    commanded_velocity (T, J), T_base_ee, T_world_ee (T, 4, 4): None if no state has one, NaN where a state has none.
-    Indexing and iteration return states, and read a block at a time.
+    commanded_velocity (T, J), T_base_ee, T_world_ee (T, 4, 4): None if absent, NaN where a state has none. Indexing
+    and iteration return states, reading a block at a time.
     """
 
     stamp_ns: Stamps

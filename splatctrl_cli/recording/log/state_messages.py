@@ -202,9 +202,9 @@ class JointStream(ColumnWriter):
 
 
 class JointLog:
-    """Joint states of a topic: `num` of them, in streams by their joints.
+    """`num` joint states of a topic, in streams by their joints.
 
-    first_names: joints of the first state, or None. notes: how often each occurs.
+    first_names: the first state's joints, or None. notes: counts by text.
     """
 
     def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:

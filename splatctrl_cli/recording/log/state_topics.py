@@ -38,7 +38,7 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `joints` (a robot's), their topics are merged. Else one topic is used: its states with the most joints; its
+    With `joints` (a robot's), their topics are merged. Else one topic is used: its states with the most joints; the
     others are left out with a note.
     """
     topics = state_topics(survey, options, loss)
@@ -78,10 +78,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """/joint_states, else the JointState topic with most messages, else one of another type.
-
-    Topics named as commands come last.
-    """
+    """The topic /joint_states, else JointState's with most messages, else another; commands come last."""
     chosen = max(
         topics,
         key=lambda t: (
@@ -110,9 +107,9 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
 def track_of_joints(topics: Sequence[TopicSurvey], joints: Sequence[str], loss: LossReport) -> RawTrack:
     """Merge the states of `joints` from as few topics as possible.
 
-    The topic with most of `joints` gives the stamps; ties prefer end-effector poses, then /joint_states. The joints
-    of other topics are interpolated at these stamps. States outside another topic's times, or in its gaps over
-    `STATES_BRIDGED` with motion, are left out with a note.
+    The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Joints of other
+    topics are interpolated. States outside those topics' times, or in their gaps over `STATES_BRIDGED` with motion,
+    are left out with a note.
     """
     tracks = _rename_joints(_tracks(topics), joints, loss)
     base = _base(tracks, joints)
@@ -168,8 +165,8 @@ def _is_command(topic: str) -> bool:
 def refuse_contradiction(topics: Sequence[TopicSurvey], joints: Sequence[str] | None) -> None:
     """Raise if the states of `joints` (None: all) come from two robots.
 
-    Raises InputError if a second topic, not of commands, has the same joints over `STATES_RIVAL` away (median).
-    Raises NotEvaluableError if two publishers take turns on one topic.
+    InputError if another topic, not of commands, has the joints over `STATES_RIVAL` away (median); NotEvaluableError
+    if two publishers take turns on one topic.
     """
     tracks = _tracks(topics)
     if joints is None:
@@ -239,10 +236,7 @@ def _rename_joints(tracks: list[RawTrack], joints: Sequence[str], loss: LossRepo
 
 
 def match_prefix(logged: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to a robot's by the prefix that fits most names.
-
-    Empty if two prefixes tie, or the best fits one name only.
-    """
+    """Map a log's joint names to a robot's by the commonest prefix; empty if unclear."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(logged):
         for joint in joints:
@@ -365,8 +359,7 @@ def _refuse_mixed(step: float, state: int, where: str) -> None:
 def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
     """Growth [s] of the log delay from first to last quarter, and the seconds between.
 
-    Compares the quarters' tenth percentiles, as single messages may be logged late. The growth is 0 if the delay
-    jumps rather than drifts.
+    Compares the quarters' tenth percentiles, as a message may be logged late. The growth is 0 if the delay jumps.
     """
     quarter = len(late) // 4
     span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0

@@ -76,14 +76,14 @@ def _numbers(seconds: Float64, period: float) -> Float64:
 def differentiate(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
-    The velocity is the slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for
-    uneven steps). Times are `smoothed_seconds`; no parabola crosses a gap. A state between two gaps has velocity 0.
+    Each is the slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven
+    steps). Times are `smoothed_seconds`; no parabola crosses a gap. A lone state has 0.
     """
     return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """Yield the velocities of `differentiate` by block: first state, velocities (K, J)."""
+    """Yield `differentiate` by block: index of the first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -127,8 +127,8 @@ class RawTrack(StateColumns):
 def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
     """Sort states by stamp, drop repeated stamps, add missing velocities; note changes in `loss`.
 
-    States with a non-finite position count as damage and are left out. Velocities that are absent or NaN, or always
-    zero for a moving joint, become slopes of the positions.
+    States with a non-finite position are damage, and left out. Velocities that are absent, NaN, or always zero for a
+    moving joint become slopes of the positions.
     """
     ordered = unwrap(_sort(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)

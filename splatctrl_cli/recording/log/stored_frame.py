@@ -1,7 +1,7 @@
 """Frames and joint states as their source stored them, which `ingest` keeps without decoding.
 
-A capture's joint_topics/K/ has stamp_ns.npy and log_time_ns.npy (T,) int64, and float64 columns: position.npy (T, J)
-and, if recorded, velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4). capture.json describes each K.
+joint_topics/K/ has stamp_ns.npy, log_time_ns.npy (T,) int64, and float64 columns: position.npy and, if any,
+velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4). capture.json describes each K.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -177,8 +177,8 @@ class StoredFrame:
 
     read_color, read_depth: return the image, or raise UndecodableMessageError. color_file: JPEG or PNG bytes of
     exactly the color. depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit
-    [m]: every depth is a uint16 multiple of this unit. These three may be None. origin: name of the source in
-    messages. places: the recorded messages, without data.
+    [m]: every depth is a uint16 multiple of it. These three may be None. origin: the source in words. places: the
+    messages, without data.
     """
 
     stamp_ns: int
@@ -197,17 +197,17 @@ class StoredFrame:
 
     @cached_property
     def color(self) -> UInt8:
-        """The colour. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
-        """The depth. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
-        """The decoded frame. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return RgbdFrame(
             stamp_ns=self.stamp_ns,
             camera=self.camera,
@@ -227,9 +227,8 @@ class StoredFrame:
 class FrameSource:
     """A `RecordSource` in stamp order: joint states, and frames as stored.
 
-    world_frame: the frame of the source's poses. states: joint states by stamp, known without reading frames.
-    joint_topics: a log's topics with joint states, None if unknown. depth_fault: why no frame has depth (image
-    folders only), None if a frame may have it.
+    world_frame: of the source's poses. states: by stamp, known without reading frames. joint_topics: a log's, None if
+    unknown. depth_fault: why no frame has depth (image folders only), None if some may.
     """
 
     name: str
@@ -270,7 +269,7 @@ class FrameSource:
 
 
 def is_kept(data: bytes | None, *kinds: bytes) -> bool:
-    """True if `data` begins as one of `kinds`, by default as JPEG or PNG."""
+    """True if `data` begins as one of `kinds`, by default JPEG or PNG."""
     return data is not None and data.startswith(kinds or (JPEG, PNG))
 
 

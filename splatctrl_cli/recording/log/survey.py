@@ -41,7 +41,7 @@ _BLOCK = 1 << 14  # pairs that are Python's numbers at once
 def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
     """Pair colour and depth by index (K, 2), at most `tolerance_ns` apart, closest pairs first.
 
-    Each index is used once; of equally close pairs, the earlier is taken. The result is sorted by colour stamp.
+    Each index is used once; of equally close pairs the earlier wins. Sorted by colour stamp.
     """
     color, depth = np.asarray(color_ns, dtype=np.int64), np.asarray(depth_ns, dtype=np.int64)
     order = np.argsort(depth, kind="stable")
@@ -64,10 +64,10 @@ def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArra
 
 @dataclass(kw_only=True)
 class StampClock:
-    """A detector of header clocks that go back; a few stamps may be errors.
+    """A detector of header clocks that go back; single stamps may err.
 
-    num_back: stamps over `IMAGES_BACK_NS` behind an earlier stamp. back_ns: how far the first of them is behind.
-    back_log_ns: its log time.
+    num_back: stamps over `IMAGES_BACK_NS` behind an earlier one. back_ns: how far behind the first was, at log time
+    back_log_ns.
     """
 
     num_back: int = 0
@@ -112,11 +112,10 @@ _MOST_BYTES = 64 << 20  # of chunks that are unpacked
 class Calibration:
     """A CameraInfo's contents.
 
-    width, height [px]. K (3, 3): of the raw image, with its distortion. projection (3, 3): of the rectified image,
-    left part of P. rotation (3, 3): from the raw axes to the rectified. projection and rotation are zero if unset.
-    valid (H, W): False where the lens did not see a rectified pixel. Size, K and projection fit binned or cropped
-    images; sensor_K (3, 3) fits the whole sensor. cut: binning and region in words. is_possible: the region is inside
-    the sensor.
+    width, height [px]. K (3, 3): of the raw, distorted image. projection (3, 3): of the rectified image (left part of
+    P). rotation (3, 3): from the raw axes to the rectified. projection and rotation are zero if unset. valid (H, W):
+    False where the lens did not see a rectified pixel. Size, K and projection fit binned or cropped images, sensor_K
+    (3, 3) the whole sensor. cut: binning and region in words. is_possible: the region is inside.
     """
 
     width: int
@@ -347,7 +346,7 @@ _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 
 def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
-    """Pairs (topic or node, text) of a log's URDFs, each text once, from first messages."""
+    """Pairs (topic or node, text) of a log's URDFs, each once, from first messages."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     of_events = {t.name for t in topics if t.type_name == EVENT} if topics else {f"/{NAME}", EVENTS}  # no index

@@ -42,9 +42,8 @@ def is_video(topic: Topic) -> bool:
 class _Stream:
     """A topic's decoder.
 
-    num: packets so far. waiting: (message without data, header) by packet number. key: the last key frame's number.
-    broken: packets with losses since that key frame. num_early, num_late: images lost before the first key frame, and
-    after.
+    num: packets. waiting: (message without data, header) by packet. key: the last key frame. broken: packets since
+    then with losses. num_early, num_late: images lost before the first key frame, and after it.
     """
 
     context: Any

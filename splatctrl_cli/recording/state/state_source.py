@@ -141,7 +141,7 @@ _SEE = "see splatctrl help replay, Twists"
 class LoggedTwists:
     """N twists: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first.
 
-    frame: the twists' frame in the log, or "". notes: dropped twists and the stamps' clock.
+    frame: as the log names it, or "". notes: dropped twists and the stamps' clock.
     """
 
     where: str

@@ -1,9 +1,9 @@
 """Joint states in CSV, NPZ, HDF5, Parquet, by a TOML (docs/replay.md, Logs); libfranka's logs.
 
 LeRobot datasets are a preset of [states]. Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list
-features in ``meta/info.json``. v2 has one ``data/chunk-000/episode_000000.parquet`` per episode. In v3, episodes
-share ``data/chunk-000/file-000.parquet``; column ``episode_index`` gives the episode. ``observation.state`` is
-position, ``timestamp`` the seconds since the episode's begin.
+features in ``meta/info.json``. v2 has a ``data/chunk-000/episode_000000.parquet`` per episode, v3 a shared
+``data/chunk-000/file-000.parquet`` with column ``episode_index``. ``observation.state`` is position, ``timestamp``
+seconds from the episode's begin.
 """
 
 import csv
@@ -41,7 +41,7 @@ class CsvTable:
     names: list[str]
 
     def index(self, name: str | int) -> int:
-        """Number of the first column so named; numbers are unchanged. Raises InputError if missing."""
+        """Number of the first column so named; numbers are unchanged. Raises InputError."""
         if isinstance(name, int):
             return name
         refuse_if(
@@ -56,8 +56,8 @@ class CsvTable:
     ) -> tuple[Stamps, dict[str, Rows]]:
         """Read stamps (T,) [ns] and each group's numbers (T, K), NaN for an empty cell.
 
-        Times count `unit_ns`; every digit is kept. Columns are names or numbers. Raises InputError for a cell that is
-        no number, naming line and column, for a line of another length, and without states.
+        Times count `unit_ns`, every digit kept; columns are names or numbers. Raises InputError for a wrong cell
+        (naming line and column), a line of another length, and no states.
         """
         chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
         at, stamps = self.index(time), array("q")
@@ -123,9 +123,8 @@ def libfranka_track(table: CsvTable) -> RawTrack:
     """The states of a log by franka::logToCSV, joints named joint1 ... joint7.
 
     The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
-    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, in earlier logs the second set of
-    ``dq_d`` (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose in column
-    order.
+    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second of two ``dq_d``
+    (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose in column order.
     """
     refuse_if(
         table.names[0] not in {"time", "duration"} or _first(table, "q", 0) is None,
@@ -192,7 +191,7 @@ INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_
 
 
 def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
-    """The keys of [states] for an episode (None: the only one). Raises InputError if unusable."""
+    """The [states] keys of an episode (None: the only one). Raises InputError."""
     info = read_json(folder / INFO)
     with refuse_faults(
         lambda error: f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
@@ -245,7 +244,7 @@ _SEE = "see splatctrl help replay, Logs"
 
 @dataclass(frozen=True, kw_only=True)
 class StatesTable:
-    """The table ``[states]``: a file and its columns; an array (T, K) gives K columns.
+    """``[states]``: a file and its columns; an array (T, K) gives K columns.
 
     epoch_ns: Unix time of time 0. pose: x, y, z, qx, qy, qz, qw, or a matrix's 16 numbers by pose_order. preset: one
     of `PRESETS`, which fills missing keys for the dataset `file`. episode: that of the dataset.
@@ -319,7 +318,7 @@ def fill_preset(path: Path, keys: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
-    """Columns of the file that a TOML's table names. Raises InputError if missing or unreadable."""
+    """Columns of the file that a TOML's table names. Raises InputError."""
     file = path.parent / name
     refuse_if(
         not file.is_file(), f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml"
