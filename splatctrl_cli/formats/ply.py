@@ -247,7 +247,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """True for a PLY with faces, or for no PLY."""
+    """True unless a PLY without faces."""
     if path.suffix.lower() != ".ply":
         return True
     header = read_bytes(path, 65536).partition(b"end_header")[0]

@@ -32,10 +32,10 @@ class SourceOptions:
 
     world_frame: of poses (default: tf's root). cameras: only these (default: all). camera_topics: the user's.
     Mappings are by camera name. camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw. camera_pose_topics:
-    topic if tf has none, and the frame that it poses or "". human_topics: images that are not 0 on a person.
-    intrinsics: fx, fy, cx, cy [px] and distortion coefficients. depth_scale [m per count]. root: of an image folder's
-    files. holdout: frames (index or name) of camera `holdout`. stamps: ``header`` or ``log``. calibration: a file of
-    `calibrate`. perturb: sizes of errors by name (`Perturbation`).
+    topic if tf has none, and the frame that it poses or "". human_topics: images, not 0 on a person. intrinsics: fx,
+    fy, cx, cy [px] and distortion coefficients. depth_scale [m per count]. root: of an image folder's files. holdout:
+    frames (index or name) of camera `holdout`. stamps: ``header`` or ``log``. calibration: a file of `calibrate`.
+    perturb: sizes of errors by name (`Perturbation`).
     """
 
     world_frame: str | None = None

@@ -55,7 +55,7 @@ class Snapshot:
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
-        """The grid of `write_states`, without log-odds; None in an older scene."""
+        """The grid, only as exact as `write_states`; None in an older scene."""
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:

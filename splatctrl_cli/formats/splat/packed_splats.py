@@ -5,8 +5,8 @@
 
 ``.spz`` (Niantic) is written in version 3, read in 2 to 4. A gzip stream has a header of 16 bytes, then by attribute
 centres (24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a
-plain header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream for each;
-empty harmonics may be left out.
+plain header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream for each.
+Empty harmonics may be left out.
 
 The axes of ``.spz`` are right, up, back; world axes are written unchanged, for reading back.
 """

@@ -122,7 +122,7 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """Read a PLY whose comments name metres and world, or neither.
+    """Read a PLY; comments name no unit but metres, no frame but world.
 
     Raises InputError as `read_ply` and `check_world`.
     """

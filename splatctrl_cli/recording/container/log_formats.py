@@ -227,7 +227,7 @@ _ENDS = 1 << 20  # bytes at either end of a file that are searched for its marks
 class Foreign:
     """An unsupported format: what it is, the remedy, and its marks.
 
-    Marks: a suffix, first bytes with a mark near either end of the file, or an entry of a zip file or folder.
+    Marks: a suffix, first bytes with a mark near either end, or an entry of a zip file or folder.
     """
 
     what: str

@@ -1,7 +1,6 @@
 """An MCAP file's messages, and its index without a full read.
 
-Damage is skipped and counted. The `mcap` package's reader allocates the sizes that records announce, and needs a
-summary.
+Damage is skipped and counted. The `mcap` package allocates the sizes that records announce, and needs a summary.
 """
 
 import struct

@@ -46,7 +46,7 @@ Shrink = Callable[[DtuView], DtuView]
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """A scan's views, their numbers, files read, and names without_depth."""
+    """A scan's views, their numbers, files read, and names of images without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
@@ -60,9 +60,9 @@ def read_dtu(
 ) -> DtuScan:
     """Read scan `scan` (default: the only one) of a DTU folder; `masks` has NNN.png.
 
-    `shrink` maps each view before the next is read. K is scaled to the images, as the file's K may be for 1600x1200
-    or a quarter. Depth of another size is sampled, not blended. Drops views without depth. Raises InputError naming
-    the file.
+    `shrink` maps each view before the next is read. K is scaled to the images, as it may be for 1600x1200 or a
+    quarter. Depth of another size is sampled, not blended. Drops views without depth. Raises InputError naming the
+    file.
     """
     scan, folder = choose_scan(root, scan_folders(root), scan)
 

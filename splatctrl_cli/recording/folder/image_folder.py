@@ -319,7 +319,7 @@ def layout_of(path: Path) -> Layout | None:
 
 
 def has_views(path: Path) -> bool:
-    """True for a folder but a ROS 2 bag, and for a layout's file."""
+    """True for a folder that is no ROS 2 bag, and for a layout's file."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 

@@ -162,7 +162,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """Frame of the colour images; a video file's is its depth's."""
+    """Frame of the colour images; for a video file, of the depth images."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 

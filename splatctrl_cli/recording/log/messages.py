@@ -386,8 +386,8 @@ def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
     A. D. Wilson, ISS 2017 (RVL). Runs of zeros and of values alternate. A value is the zigzag-coded difference from
-    the last nonzero pixel. Numbers are nibbles of three bits, lowest first, with a high bit if another follows.
-    Nibbles fill 32-bit words from the top. Raises ValueError if invalid.
+    the last nonzero pixel. Numbers are stored in nibbles: three bits each, lowest first, and a high bit if another
+    follows. Nibbles fill 32-bit words from the top. Raises ValueError if invalid.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length

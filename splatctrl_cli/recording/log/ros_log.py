@@ -132,7 +132,7 @@ Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Messages that wait for others of their frame: half of a log with topics apart."""
+    """Messages waiting for their frame: up to half of a log that stores topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}

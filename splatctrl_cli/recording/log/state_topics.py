@@ -78,7 +78,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """The topic /joint_states, else JointState's with most messages, else another; commands come last."""
+    """Prefer /joint_states, then the JointState topic with most messages, then others; commands come last."""
     chosen = max(
         topics,
         key=lambda t: (

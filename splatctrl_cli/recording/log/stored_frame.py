@@ -261,7 +261,7 @@ class FrameSource:
         return merge_by_stamp(self.states, self._frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield (stamp [ns], camera, T_world_camera (4, 4)) in stamp order, without reading images."""
+        """Yield (stamp [ns], camera, T_world_camera (4, 4)) in stamp order, without images."""
         return iter(())
 
     def _frames(self) -> Iterator[StoredFrame]:

@@ -134,7 +134,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic; stamps_ns and clock, for images only, use header stamps or log times."""
+    """A topic; stamps_ns and clock (images only) are header stamps or log times."""
 
     topic: Topic
     count: int = 0

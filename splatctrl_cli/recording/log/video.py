@@ -200,7 +200,7 @@ class VideoFileLog(RawLog):
         self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the images. Raises InputError if there are more or fewer images than stamps."""
+        """Yield the images. Raises InputError if images and stamps differ in number."""
         if names is not None and self.channels[0].name not in names:
             return
         num, losses = 0, Damage()
