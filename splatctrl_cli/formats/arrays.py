@@ -1,7 +1,7 @@
 """Arrays in ``.npz`` (same arrays, same bytes), read within a size limit.
 
 NPZ, HDF5 and Parquet (extra `tables`: h5py, pyarrow) are read in blocks of rows. HDF5 names arrays by path
-(``observations/qpos``), Parquet by column; equal lists make an array (T, K).
+(``observations/qpos``), Parquet by column; a column of equally long lists is an array (T, K).
 """
 
 import tokenize
@@ -52,7 +52,7 @@ def savez(path: Path, arrays: Mapping[str, Values | Pieces], *, level: int = 6) 
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, Values]:
     """Read the arrays `names` (default: all) of a ``.npz``, at most `most` bytes together.
 
-    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or another size, and
+    Raises OSError, KeyError for a missing array, ValueError for objects, over `most` bytes or a wrong size, and
     `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
@@ -77,7 +77,7 @@ def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
 
 
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read a ``.npy`` header, no further: shape, is_by_columns, dtype. Raises ValueError without one."""
+    """Read only a ``.npy`` header: shape, is_by_columns, dtype. Raises ValueError without one."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, is_fortran, dtype = read(stream)
@@ -155,7 +155,7 @@ class ArrayFile(ABC):
             len(set(lengths)) > 1, f"{self.path}: expected arrays of one length, got {texts}", remedy="check the file"
         )
         widths = [prod(shape[1:]) for shape, _ in headers]
-        parts = [  # how many rows its blocks have is its own
+        parts = [  # each array's blocks have their own number of rows
             RowFile((width,), (part.reshape(len(part), width).astype(np.float64) for part in self._blocks(name)))
             for name, width in zip(names, widths, strict=True)
         ]
@@ -175,7 +175,7 @@ class ArrayFile(ABC):
         return Rows(RowFile(shape[1:], (block.astype(np.float64) for block in self._blocks(name))))
 
     def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
-        """Stamps (T,) [ns] of times in `unit_ns`, or of a dtype with its own unit."""
+        """Stamps (T,) [ns] of times in `unit_ns`, or of datetime64 in its own unit."""
         _, dtype = self._checked(name, least=least, kinds="iufM")
         times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
         refuse_if(
@@ -308,7 +308,7 @@ class Hdf5File(ArrayFile):
 
 
 class ParquetFile(ArrayFile):
-    """A Parquet file, or its rows whose column `only` has a value."""
+    """A Parquet file; only (column, value): its rows with this value."""
 
     def __init__(self, path: Path, only: tuple[str, int] | None = None) -> None:
         """Raises InputError for another kind of file."""

@@ -104,7 +104,7 @@ def _png_head(data: bytes) -> ImageHead | None:
 def decode_file(data: bytes, *, color: bool) -> Array | None:
     """Decode a JPEG, PNG, WebP, ..., ignoring its orientation tag; None if invalid or truncated.
 
-    color: 8-bit RGB; else as OpenCV has it, in BGR.
+    color: 8-bit RGB; else as OpenCV reads it, in BGR.
     """
     if (
         not data

@@ -58,7 +58,7 @@ class PlyFile:
 
 @dataclass(frozen=True, kw_only=True)
 class _Element:
-    """properties: names and scalar types; of a list, length and values, with a space between."""
+    """properties: names and scalar types; a list has types of length and values, space between."""
 
     name: str
     count: int
@@ -126,8 +126,8 @@ def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) 
 def write_table(path: Path, rows: Array, comments: Mapping[str, str]) -> None:
     """Write `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
 
-    Comments follow the properties, for some readers. Non-ASCII is escaped. Raises UsageError for a comment of several
-    lines, or a key with a colon.
+    Comments follow the properties, for some readers. Non-ASCII text is escaped. Raises UsageError for a comment of
+    several lines, or a key with a colon.
     """
     fields: Mapping[str, Any] = rows.dtype.fields or {}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -219,7 +219,7 @@ def _parse_header(path: Path, content: bytes) -> tuple[str, list[_Element], list
 def read_points(path: Path) -> PointCloud:
     """Read a PLY's points x, y, z [m] with red, green, blue (0 to 255).
 
-    Raises InputError if truncated, empty or without one of these.
+    Raises InputError if truncated, empty or without one of these properties.
     """
     table = _columns(path, ("x", "y", "z", "red", "green", "blue"), "coloured point cloud")
     points, colors = table[:, :3], table[:, 3:] / 255.0
@@ -247,7 +247,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """True for a PLY with faces, or any other file."""
+    """True unless a PLY without faces."""
     if path.suffix.lower() != ".ply":
         return True
     header = read_bytes(path, 65536).partition(b"end_header")[0]
@@ -264,8 +264,8 @@ _Line = tuple[int, list[str]]
 def point_blocks(stream: TextIO, name: str) -> Iterator[Float64]:
     """Yield a CSV's points as (Q, 3) float64 [m], at most `POINTS_PER_BLOCK` at once.
 
-    Without a header (a first line not all numbers) it has three columns; others are ignored. Raises InputError for a
-    missing column, a line of another length, or no finite number within `MAX_PLACE`.
+    A first line of three numbers is no header. Else the header names x, y, z; other columns are ignored. Raises
+    InputError for a missing column, a line of another length, or no finite number within `MAX_PLACE`.
     """
     reader = csv.reader(stream)
     lines: Iterator[_Line] = ((reader.line_num, row) for row in reader if row)

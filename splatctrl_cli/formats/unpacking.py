@@ -1,4 +1,4 @@
-"""File reads, and bounded decompression to no more than announced."""
+"""File reads, and decompression to no more than announced."""
 
 import bz2
 import tomllib
@@ -63,7 +63,7 @@ class Budget:
 def unpacked(data: bytes, compression: str, size: int, largest: int = MAX_BLOCK) -> bytes:
     """Unpack the announced `size` bytes of `data`, never more.
 
-    Raises BadBlockError for unknown or broken compression, a size over `largest`, or another than announced.
+    Raises BadBlockError for unknown or damaged compression, or a size over `largest` or other than announced.
     """
     refuse_if(size > largest, f"announces {size} bytes unpacked, at most {largest} are read", error=BadBlockError)
     content = _unpacked_up_to(data, compression, size + 1)

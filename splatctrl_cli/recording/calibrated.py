@@ -68,7 +68,7 @@ class Correction:
         )
 
     def late_ns(self, name: str) -> int:
-        """Delay [ns] of frame stamps against poses; 0 if fixed."""
+        """Delay [ns] of frame stamps against poses; 0 for a fixed camera."""
         return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
@@ -83,7 +83,7 @@ class Correction:
         return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
 
     def frame(self, frame: RgbdFrame) -> RgbdFrame:
-        """Correct a frame whose pose is already that of its time on the robot's clock."""
+        """Correct a frame whose pose already follows the robot's clock."""
         return replace(
             frame,
             T_world_camera=self.pose(frame.camera, frame.T_world_camera),
@@ -133,7 +133,7 @@ def read_correction(options: SourceOptions, where: str) -> Correction | None:
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
     """The source, corrected, then perturbed by the options.
 
-    Raises InputError for another recording's calibration, UsageError as `Perturbation.of`.
+    Raises InputError for another recording's calibration, UsageError for an invalid perturbation.
     """
     correction, perturbation = read_correction(options, source.name), Perturbation.of(options.perturb)
     if correction is not None:
@@ -160,7 +160,7 @@ def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
 class ChangedSource(FrameSource):
     """Another source's records, corrected by a calibration or perturbed, in memory.
 
-    A calibrated clock moves joint states. A moving camera then takes its pose at the frame's time on the robot's
+    A calibrated clock shifts joint states. A moving camera's pose is then that of the frame's time on the robot's
     clock. Frames without a pose within `tolerance_ns` are left out and counted.
     """
 
@@ -238,10 +238,10 @@ LIMITS = {"depth-noise": 1.0, "pose-error": 10.0, "pose-turn": 180.0, "seed": 2*
 
 @dataclass(frozen=True, kw_only=True)
 class Perturbation:
-    """Errors drawn from `seed`, proportional to their size.
+    """Errors drawn from `seed`, scaled by their sizes.
 
-    depth_noise: standard deviation at 1 m [m]; grows with depth squared. pose_error [m], pose_turn [degrees]: a shift
-    and a turn of each camera.
+    depth_noise: standard deviation [m] at 1 m, which grows with depth squared. pose_error [m], pose_turn [degrees]:
+    size of each camera's shift and turn.
     """
 
     depth_noise: float = 0.0
@@ -251,7 +251,7 @@ class Perturbation:
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> "Perturbation | None":
-        """Build from values by name, or None without effect. Raises UsageError for an unknown one."""
+        """Build from sizes by name, or None if all are 0. Raises UsageError if invalid."""
         for name, value in values.items():
             refuse_if(
                 name not in LIMITS,
@@ -268,7 +268,7 @@ class Perturbation:
         return perturbation if perturbation.depth_noise or perturbation.pose_error or perturbation.pose_turn else None
 
     def depth(self, camera: str, stamp_ns: int, depth: Float32) -> Float32:
-        """Add noise to depth (H, W) [m]; 0 where none is or remains."""
+        """Add noise to depth (H, W) [m]; no return stays 0, negative depth becomes 0."""
         noise = self._generator(camera, stamp_ns).standard_normal(depth.shape, np.float32)
         noisy = depth + np.float32(self.depth_noise) * depth**2 * noise
         return np.where((depth > 0) & (noisy > 0), noisy, np.float32(0.0)).astype(np.float32)

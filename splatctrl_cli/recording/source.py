@@ -74,7 +74,7 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
     """Open one input, or several logs recorded at the same time.
 
-    Raises as `open_source`, and InputError if one of several is no log.
+    Raises InputError as `open_source`, and if one of several is no log.
     """
     log = open_logs(paths)
     options = options or SourceOptions()
@@ -82,14 +82,14 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, str, str]]:
-    """Path, topic or node, and text of logs' and captures' URDFs, each once."""
+    """Triples (path, topic or node, text) of logs' and captures' URDFs, each once."""
     by_text: dict[str, tuple[Path, str, str]] = {}
     for path in paths:
         descriptions = []
         if is_capture(path):
             descriptions = read_robot_description(path)
         elif path.exists() and not has_views(path):
-            with suppress(InputError):  # who reads it says why
+            with suppress(InputError):  # a later reader gives the reason
                 descriptions = robot_descriptions(open_raw_log(path))
         for where, text in descriptions:
             by_text.setdefault(text, (path, where, text))
@@ -135,7 +135,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
-    """Topics, times, frames, cameras, and what a reconstruction misses."""
+    """Describe topics, times, frames, cameras, and what a reconstruction lacks."""
     survey, sampling = survey_to_describe(log)
     logged = [t for t in survey.topics.values() if t.count]
     first, last = min((t.first_log_ns for t in logged), default=0), max((t.last_log_ns for t in logged), default=0)

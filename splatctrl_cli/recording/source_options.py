@@ -30,12 +30,12 @@ class CameraTopics:
 class SourceOptions:
     """The user's settings for an input; the defaults fit a well-formed log.
 
-    world_frame: of poses (default: tf's root). cameras: only these (default: all). By camera name: camera_topics;
-    camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw; camera_pose_topics if tf has
-    none, with the frame that they pose or ""; human_topics:
-    images not 0 on a person; intrinsics: fx, fy, cx, cy [px] and distortion coefficients. depth_scale [m per count].
-    root: of an image folder's files. holdout: its frames (index or name) for camera `holdout`. stamps: ``header`` or
-    ``log``. calibration: a file of `calibrate`. perturb: changes to frames (`calibrated`).
+    world_frame: of poses (default: tf's root). cameras: only these (default: all). camera_topics: the user's.
+    Mappings are by camera name. camera_poses: fixed T_world_camera as x, y, z, qx, qy, qz, qw. camera_pose_topics:
+    topic if tf has none, and the frame that it poses or "". human_topics: images, not 0 on a person. intrinsics: fx,
+    fy, cx, cy [px] and distortion coefficients. depth_scale [m per count]. root: of an image folder's files. holdout:
+    frames (index or name) of camera `holdout`. stamps: ``header`` or ``log``. calibration: a file of `calibrate`.
+    perturb: sizes of errors by name (`Perturbation`).
     """
 
     world_frame: str | None = None
@@ -56,7 +56,7 @@ class SourceOptions:
     perturb: Mapping[str, float] = field(default_factory=dict)
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
-        """Raise InputError for a set option that does not apply to this input."""
+        """Raise InputError if an option of `names` is set: they do not apply to `kind`."""
         flags = {
             "camera_topics": "camera",
             "human_topics": "human-topic",

@@ -23,7 +23,7 @@ from splatctrl_cli.records import DistanceGrid, Values
 FORMAT = "splatctrl distance grid"
 VERSION = 2
 CHUNK = 1 << 24  # [bytes] of a channel that are copied at a time
-TILE = 16  # layers of x that are turned at a time: four times as fast as all at once, 512 x 512 x 512 float32
+TILE = 16  # layers of x that are transposed at a time: four times as fast as all at once, 512 x 512 x 512 float32
 Shape = tuple[int, int, int]
 STEM = "field"
 FIELD_FACTS = (
@@ -34,7 +34,7 @@ FIELD_FACTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Channel:
-    """A channel's storage; may_be_unknown: unknown space may blank it."""
+    """A channel's storage; may_be_unknown: cells in unknown space may be NaN."""
 
     dtype: str
     components: int = 1
@@ -151,10 +151,11 @@ def x_fastest(values: Values) -> Iterator[Values]:
 class GridFormat:
     """A file format, in its module's ``ENTRIES``.
 
-    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`.
-    `describe`: from a path and its first bytes; None for another kind. `needs`: one of these channels.
-    `holds_unknown`: cells without a distance. `bytes_per_cell`: on disk, None for all channels'. `check` raises
-    UsageError without its library. `docs`: row in docs/artefacts.md: name | file | who opens it.
+    `name`: the --formats value. `write`: to a path with `suffix`, or a file per channel if `is_per_channel`;
+    InputError for invalid channels. `describe`: from a path and its first bytes; None for another kind. `needs`: at
+    least one of these channels. `holds_unknown`: stores cells without a distance. `bytes_per_cell`: on disk, None for
+    the sum of all channels. `check` raises UsageError without its library. `docs`: row in docs/artefacts.md: name |
+    file | who opens it.
     """
 
     name: str
@@ -270,7 +271,7 @@ class GridSlabs:
         return self.num_layers == self.plan.shape[0]
 
     def grid(self, header: Mapping[str, object]) -> DistanceGrid:
-        """Open as read-only memory maps. Raises InputError before it is whole."""
+        """Open as read-only memory maps. Raises InputError before the grid is whole."""
         refuse_if(
             not self.is_whole(),
             f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
@@ -288,7 +289,7 @@ class GridSlabs:
 
 
 def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
-    """Create an empty store at full size. A full disk is an OSError here."""
+    """Create an empty store at full size. Raises OSError for a full disk."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / PROGRESS).unlink(missing_ok=True)
     for name in plan.channels:

@@ -14,7 +14,7 @@ FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__pa
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
     """Raise UsageError if `write_grid` would fail for `names`.
 
-    unknown: the policy; ``nan`` blanks cells.
+    unknown: the policy; ``nan`` leaves cells without a distance.
     """
     strange = [name for name in names if name not in FORMATS]
     refuse_if(
@@ -42,7 +42,7 @@ def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: s
 def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[Path, ...]:
     """Write the grid in the formats `names` into `folder`; return the files.
 
-    Memory maps are never whole in memory (but for vdb). Raises as `check_formats`, and NotEvaluableError without a
+    Only vdb needs whole channels in memory. Raises UsageError as `check_formats`, NotEvaluableError without a
     surface.
     """
     check_formats(names, grid.channels)

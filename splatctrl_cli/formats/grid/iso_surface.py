@@ -18,11 +18,11 @@ from splatctrl_cli.records import DistanceGrid, Float32, Float64
 
 SUFFIXES = (".ply", ".obj", ".stl")
 STEP = 2.0**-13  # [cells] to which vertices are rounded: float32 has no more in a grid of some hundred layers
-FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cube is looked at
+FURTHEST = np.float32(1e9)  # [m] in place of unknown distances, whose cubes are skipped
 
 
 def iso_surface(grid: DistanceGrid) -> Any:
-    """Extract the zero set of `sdf`, linear between centres; NaN corners have none.
+    """Extract the zero set of `sdf`, linear between centres; skip cubes with NaN corners.
 
     A trimesh: vertices (V, 3) float64 [m], world; faces (F, 3) int64, anticlockwise from larger distances.
 

@@ -36,7 +36,7 @@ _Members = dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]
 
 
 def write_npz(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid. Raises InputError for invalid channels."""
+    """Write the grid."""
     check_grid(grid)
     members: dict[str, Values] = {
         "origin": np.asarray(grid.origin, dtype="<f8"),
@@ -49,7 +49,7 @@ def write_npz(path: Path, grid: DistanceGrid) -> None:
 def read_npz(path: Path, *, with_values: bool = True) -> DistanceGrid:
     """Read the grid of `write_npz`; never unpickles. Without values, channels are zeros.
 
-    Raises InputError if missing, damaged (checksums included), not finite, of another version or not ours. NaN is
+    Raises InputError if missing, damaged (checksums included), not finite, of another version or program. NaN is
     allowed in sdf and gradient if the header's ``unknown`` is ``nan``.
     """
     with _opened(path) as archive:

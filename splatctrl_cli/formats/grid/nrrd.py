@@ -27,7 +27,7 @@ _TYPES = {"<f4": "float", "|u1": "uint8"}
 
 
 def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
-    """Write a channel; NaN is kept. Raises InputError for invalid channels."""
+    """Write a channel; NaN is kept."""
     shape, kind, step = check_grid(grid), CHANNELS[channel], repr(float(grid.voxel))
     directions = [f"({step},0,0)", f"(0,{step},0)", f"(0,0,{step})"]
     sizes, kinds = [str(n) for n in shape], ["domain"] * 3

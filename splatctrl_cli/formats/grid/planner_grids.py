@@ -2,11 +2,11 @@
 
 cuRobo's voxel grid is ``field.curobo.npz``, by its source (NVlabs/curobo, 0.7.5 to 0.7.7, not 0.7.0 to 0.7.4:
 geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested. (x, y, z) is flattened
-with z fastest; the middle's pose is ``x y z qw qx qy qz``. Values are positive inside; ``1 + floor(dims / voxel)``
-cells a side.
+with z fastest; the middle's pose is ``x y z qw qx qy qz``. Values are positive inside; there are
+``1 + floor(dims / voxel)`` cells a side.
 
 The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
-pose is half a voxel below our cells' middle. A sphere takes its centre's cell. The first three and last two cells of
+pose is half a voxel below our cells' middle. A sphere reads its centre's cell. The first three and last two cells of
 an axis, and the outside, are free.
 
 MoveIt's distance field reads occupied cells: moveit_core, distance_field/src/propagation_distance_field.cpp
@@ -96,8 +96,8 @@ ROUNDING = 1e-6  # [m] of float32 values a metre or two from their origin
 def write_moveit(path: Path, grid: DistanceGrid) -> None:
     """Write occupied cells: a splat may reach the cube, or sdf is at most 0.
 
-    A splat may reach it if ``bound <= 0``, or ``hard <= sqrt(3)/2 voxel`` without bound. NaN and unknown obstacles
-    count as sdf of at most 0. Raises InputError with neither bound nor hard.
+    A splat may reach the cube if ``bound <= 0``; without bound, if ``hard <= sqrt(3)/2 voxel``. NaN and unknown
+    obstacles count as sdf of at most 0. Raises InputError with neither bound nor hard.
     """
     shape = check_grid(grid)
     refuse_if(

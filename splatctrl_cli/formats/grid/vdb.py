@@ -35,8 +35,8 @@ _NUMBERS = {"int32": "<i", "int64": "<q", "float": "<f", "double": "<d", "bool":
 def write_vdb(path: Path, grid: DistanceGrid) -> None:
     """Write the grid; inactive voxels read as the float above the channel's largest.
 
-    Positive: query active voxels only. A gradient's is zero. Raises UsageError without OpenVDB, InputError for an
-    invalid layout.
+    That is positive, so query active voxels only. A gradient's inactive voxels are zero. Raises UsageError without
+    OpenVDB.
     """
     check_grid(grid)
     vdb = openvdb()
@@ -93,8 +93,8 @@ def _plain(value: object) -> object:
 def read_vdb_head(path: Path) -> list[tuple[str, str, dict[str, object]]]:
     """Read name, type and metadata of a ``.vdb``'s grids, without OpenVDB.
 
-    As in OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises InputError for
-    another or a damaged file.
+    Layout: OpenVDB's io/Archive.cc, io/GridDescriptor.cc and MetaMap.cc, since file version 222. Raises InputError
+    for another or a damaged file.
     """
     with path.open("rb") as stream:
         refuse_if(

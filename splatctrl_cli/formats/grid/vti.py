@@ -1,7 +1,7 @@
 """Baked distance fields as ParaView's ``.vti``: VTK ImageData with points at cell centres.
 
-Raw appended little-endian blocks, x fastest, each after its length; the header is a string in FieldData (VTK's page
-on XML file formats).
+Values are raw appended little-endian blocks, x fastest, each after its length. The header is a string in FieldData
+(VTK's page on XML file formats).
 """
 
 import re
@@ -39,7 +39,7 @@ _REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
 
 
 def write_vti(path: Path, grid: DistanceGrid) -> None:
-    """Write the grid; NaN is kept. Raises InputError for invalid channels."""
+    """Write the grid; NaN is kept."""
     x, y, z = check_grid(grid)
     extent = f"0 {x - 1} 0 {y - 1} 0 {z - 1}"
     origin, spacing = (" ".join(repr(float(v)) for v in values) for values in (grid.origin, [grid.voxel] * 3))
@@ -82,7 +82,7 @@ def write_vti(path: Path, grid: DistanceGrid) -> None:
 def read_vti(path: Path, *, with_values: bool = True) -> DistanceGrid:
     """Read a `write_vti` grid; without values, channels are zeros.
 
-    Raises InputError if missing, damaged or not ours.
+    Raises InputError if missing, damaged or of another program.
     """
     with _opened(path) as stream:
         grid, starts = _head(path, stream)
@@ -104,7 +104,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[DistanceGrid, dict[str, int]]:
-    """The grid of zeros, and by channel the offset [bytes] of its length, before its values."""
+    """The grid with zeros, and each channel's offset [bytes]: its length, then its values."""
     text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1

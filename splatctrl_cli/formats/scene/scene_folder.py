@@ -55,7 +55,7 @@ class Snapshot:
         return self.path.with_suffix(".npz")
 
     def occupancy(self) -> OccupancyGrid | None:
-        """The grid, as coarse as `write_states`; None in an older scene."""
+        """The grid, only as exact as `write_states`; None in an older scene."""
         return self._read_voxels(read_states)
 
     def seen(self) -> SeenVoxels | None:
@@ -95,7 +95,7 @@ class ViewCorrection:
 def run_value(
     run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
 ) -> T:
-    """`kind` of the value at `keys` of a ``run.json``, or of the default.
+    """Convert the value at `keys` of a ``run.json``, or the default, by `kind`.
 
     Raises InputError naming `where` if missing without a default, or of another kind.
     """
@@ -173,7 +173,7 @@ class SceneFolder:
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """Facts of its log and robot.
+        """Facts of the scene's log and robot.
 
         Digests (`inputs`), first frames, joints and links, depth correction, and the robot's residual.
         """
@@ -214,7 +214,7 @@ class SceneFolder:
 
     @property
     def is_anisotropic(self) -> bool:
-        """True for 3D Gaussian splatting: `gaussians`, no splats and occupancy."""
+        """True for 3D Gaussian splatting: it has `gaussians`, no splats or occupancy."""
         return self._metric("method", "3dgs".__eq__, "")
 
     def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:

@@ -58,7 +58,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 class SceneWriter:
-    """A writer of a scene during fitting, into an empty or checkpoint's folder.
+    """A writer of a scene during fitting, into an empty folder or a checkpoint's.
 
     Snapshots are written in the background; the next call raises their errors.
     """
@@ -146,7 +146,7 @@ class SceneWriter:
             write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
-        """Replace the checkpoint atomically after its files; the last is compressed."""
+        """Replace the checkpoint atomically, once its files are on disk; compress the last."""
         self.settle()
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:

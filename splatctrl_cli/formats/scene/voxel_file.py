@@ -95,9 +95,9 @@ def read_states(path: Path) -> OccupancyGrid:
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
-    """Read voxels' last views and lost edges alone.
+    """Read only voxels' last views and lost edges.
 
-    None if older. Raises InputError for another file.
+    None in an older file. Raises InputError for another kind.
     """
     with _refuse(path, _OURS):
         header = _read_header(path)
@@ -131,7 +131,7 @@ def read_occupancy(path: Path) -> OccupancyGrid:
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
-    """Read all of ``occupancy.npz``; None if older. Raises as `read_occupancy`."""
+    """Read all of ``occupancy.npz``; None in an older file. Raises InputError otherwise."""
     with _refuse(path, _OCCUPANCY):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -155,7 +155,7 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
 
 
 def read_unrepresented(path: Path) -> Balls | None:
-    """Read only unrepresented voxels; None if older. Raises InputError for another file."""
+    """Read only unrepresented voxels; None in an older file. Raises InputError for another kind."""
     with _refuse(path, _OURS):
         header = _read_header(path)
         if "step_stamps_ns" not in header:
@@ -172,7 +172,7 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 
 
 def _last_seen(stored: Array, header: Mapping[str, Any], num_steps: int) -> Array:
-    """`last_seen` in one byte or two; the largest numbers give reasons for never."""
+    """Check `last_seen` of one byte or two; its largest numbers say why never seen."""
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
     is_old = "unseen" not in header  # then only the largest number is no time step, and means `UNANSWERED`

@@ -2,8 +2,8 @@
 
 ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma), ``rot_*``
 a quaternion w x y z, ``opacity`` a logit. ``f_dc_*`` and ``f_rest_*`` are harmonics; f_rest has all of red, then
-green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object. A lone ``scale_0`` is for all
-axes.
+green, then blue. A ``label`` (uchar) follows only if some Gaussian is not an object. ``scale_0`` without the
+others is for all axes.
 """
 
 from collections.abc import Callable, Mapping
@@ -40,7 +40,7 @@ def sigmoid(logits: Float64) -> Float32:
 
 
 def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
-    """exp(x) as float32 [m]. Raises InputError for one outside normal float32."""
+    """exp(x) as float32 [m]. Raises InputError for a value outside normal float32."""
     values = np.exp(np.clip(logs, -700.0, 700.0))
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
@@ -48,7 +48,7 @@ def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
 
 
 def unit_quaternions(where: str, quats: Floats) -> Float32:
-    """Normalise (N, 4), bit-exact if already unit. Raises InputError for zero length."""
+    """Normalise (N, 4), unchanged if already unit. Raises InputError for zero length."""
     wide = quats.astype(np.float64)
     lengths = np.linalg.norm(wide, axis=1, keepdims=True)
     refuse(where, "rotation", quats, np.asarray(~(lengths[:, 0] > 1e-12)), "a quaternion that is not zero")
@@ -94,9 +94,9 @@ class Differences:
 
 
 def float32_bound(gaussians: GaussianSet) -> Differences:
-    """A float32 format's bound: centres exact, one rounding of the rest.
+    """A float32 format's bound: exact centres, one rounding of other values.
 
-    A log sigma is at most 88: half a unit of its last place is 5e-6 of sigma.
+    A log sigma is at most 88, so half a unit of its last place is 5e-6 of sigma.
     """
     largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
     return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
@@ -134,9 +134,9 @@ def _angles(a: Float32, b: Float32) -> Float64:
 class SplatFormat:
     """A splat file format, in its module's ``ENTRIES``.
 
-    `reduce`: the representable part of a set; `bound`: the largest rounding; `check` raises UsageError without its
-    library. `docs`: rows in docs/artefacts.md, an empty line between: suffix | what it is | what it rounds to | what
-    it cannot represent.
+    `write`: same input, same bytes; InputError for an invalid value. `reduce`: the representable part of a set;
+    `bound`: the largest rounding; `check` raises UsageError without its library. `docs`: rows in docs/artefacts.md,
+    an empty line between: suffix | what it is | what it rounds to | what it cannot represent.
     """
 
     name: str
@@ -175,10 +175,10 @@ HEADER_COMMENTS = {
 
 
 def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`, with frame, units and `comments` in the header. Same input, same bytes.
+    """Write `gaussians`, with frame, units and `comments` in the header.
 
-    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises InputError for an invalid
-    value, UsageError for a comment of several lines.
+    Harmonics above the set's degree are 0; opacities 0 and 1 read back exactly. Raises UsageError for a comment of
+    several lines.
     """
     check_gaussians("Gaussians to write", gaussians)
     has_labels = bool((gaussians.labels != Label.OBJECT).any())
@@ -203,8 +203,8 @@ def rows_of(gaussians: GaussianSet, dtype: "np.dtype[Any]") -> Array:
 def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), less all-zero degrees. Quaternions are normalised; a
-    missing label is 0 (object). Raises InputError if truncated, invalid or without a `REQUIRED` property.
+    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45), less all-zero top degrees. Quaternions are normalised;
+    a missing label is 0 (object). Raises InputError if truncated, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()
@@ -240,7 +240,7 @@ def exact_centers(ply: PlyFile) -> Float64:
 def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
     """Centres (N, 3) float32 [m]. Raises InputError if rounding moves splats too far.
 
-    The measure is `sigmas` (N,) or (N, 3) [m] and their box's length.
+    The limit follows from `sigmas` (N,) or (N, 3) [m] and their box's length.
     """
     exact = exact_centers(ply)
     centers = exact.astype(np.float32)
@@ -269,7 +269,7 @@ def centers_of(ply: PlyFile, sigmas: Float32) -> Float32:
 def log_sigmas(ply: PlyFile) -> Float64:
     """(N, 3) log(sigma [m]). Raises InputError for two scales, or scales that are no logarithms.
 
-    They are none if no scale is below 0 and 95 % of splats exceed SPARSEST times their spacing.
+    Scales are no logarithms if none is below 0 and 95 % of splats exceed SPARSEST times their spacing.
     """
     names = [name for name in SCALES if name in ply.names]
     refuse_if(

@@ -1,7 +1,7 @@
 """Gaussians as glTF 2.0 in one binary file (``.glb``), with KHR_gaussian_splatting.
 
 A primitive of points has float32 centre, rotation (x y z w), sigmas (linear), opacity, harmonics of red, green, blue;
-COLOR_0 serves plain point readers. Values are in world; the node turns z up to glTF's y.
+COLOR_0 serves plain point readers. Values are in world; the node turns its z axis to glTF's y.
 """
 
 import json
@@ -110,9 +110,9 @@ def _table(path: Path, document: Mapping[str, Any], binary: bytes, index: int, w
 
 
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write `gaussians`; `comments` become the asset's extras. Same input, same bytes.
+    """Write `gaussians`; `comments` become the asset's extras.
 
-    ``_LABEL`` is written if some Gaussian is not an object. Raises InputError for an invalid value.
+    ``_LABEL`` is written if some Gaussian is not an object.
     """
     check_gaussians("Gaussians to write", gaussians)
     colors = np.clip(0.5 + SH_C0 * gaussians.harmonics[:, 0].astype(np.float64), 0.0, 1.0)
@@ -143,7 +143,7 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """Read a ``.glb`` file in its mesh's axes (no node's transform), and its extras.
+    """Read a ``.glb`` file in its mesh's axes (ignoring nodes' transforms), and its extras.
 
     Raises InputError if truncated, packed, or without exactly one Gaussian primitive.
     """

@@ -1,14 +1,14 @@
 """The packed splat formats ``.splat`` and ``.spz``, in the world's axes.
 
-``.splat``: 32 bytes per Gaussian, no header: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is
-1); a quaternion w x y z as 128 q + 128. No view-dependent colour, labels or comments.
+``.splat`` has 32 bytes per Gaussian, no header: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is
+1); a quaternion w x y z as 128 q + 128. It has no view-dependent colour, labels or comments.
 
-``.spz`` (Niantic): writes version 3, reads 2 to 4. A gzip stream: a header of 16 bytes, then by attribute centres
-(24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a plain
-header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream each; empty
-harmonics may be left out.
+``.spz`` (Niantic) is written in version 3, read in 2 to 4. A gzip stream has a header of 16 bytes, then by attribute
+centres (24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a
+plain header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream for each.
+Empty harmonics may be left out.
 
-The format's axes are right, up, back; world axes are written unchanged, for reading back.
+The axes of ``.spz`` are right, up, back; world axes are written unchanged, for reading back.
 """
 
 import gzip
@@ -40,9 +40,9 @@ ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("
 
 
 def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write what `.splat` can represent of `gaussians`, without `comments`. Same input, same bytes.
+    """Write what `.splat` can represent of `gaussians`, without `comments`.
 
-    A quaternion's largest component is negative: -1 has a byte. Raises InputError for an invalid value.
+    A quaternion's largest component is made negative, as a byte can be -1 but not 1.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)
@@ -103,10 +103,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 
 
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    """Write what `.spz` can represent of `gaussians`, without `comments`. Same input, same bytes.
-
-    Raises InputError for an invalid value.
-    """
+    """Write what `.spz` can represent of `gaussians`, without `comments`."""
     check_gaussians("Gaussians to write", gaussians)
     clipped, bits = reduce_to_spz(gaussians), _fraction_bits(gaussians.centers)
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[clipped.harmonics.shape[1]]
@@ -124,7 +121,7 @@ def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 
 
 def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
-    """Read an ``.spz`` file, in its axes, and no comments.
+    """Read an ``.spz`` file, in its own axes; comments are empty.
 
     Raises InputError if truncated, invalid, or not of version 2 to 4.
     """
@@ -159,8 +156,8 @@ def reduce_to_spz(gaussians: GaussianSet) -> GaussianSet:
 def spz_bound(gaussians: GaussianSet) -> Differences:
     """Half a step of each value, with a margin for float32.
 
-    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511 are 1.2e-3 together, twice with the
-    fourth, and twice that as an angle: 0.28 degrees.
+    Sigma: a factor exp(1/32). Rotation: half a step of sqrt(1/2) / 511 in three components is 1.2e-3; the fourth
+    doubles this, and the angle again: 0.28 degrees.
     """
     return Differences(
         center=0.5001 * (2.0 ** -_fraction_bits(gaussians.centers)),
@@ -267,7 +264,7 @@ def _fraction_bits(centers: Float32) -> int:
 def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
     """Little-endian words (N,).
 
-    2 bits index the largest of x y z w, then 10 bits (sign, size) per other.
+    2 bits index the largest of x y z w; 10 bits (sign, size) follow for each other.
     """
     quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)

@@ -100,9 +100,10 @@ def _is_stretched(gaussians: GaussianSet) -> Bool:
 
 
 def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
-    """Write `splats`, with frame, units and `comments` in the header. Same input, same bytes.
+    """Write `splats`, with frame, units and `comments` in the header.
 
-    Opacities 0 and 1 read back exactly. Raises as `write_gaussian_ply`.
+    Opacities 0 and 1 read back exactly. Raises InputError for an invalid value, UsageError for a comment of several
+    lines.
     """
     check_splats("splats to write", splats)
     rows = rows_of(as_gaussians(splats), DTYPE)
@@ -113,7 +114,7 @@ def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None
 def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """Read a 3D-GS PLY (binary or ASCII, any property order) and its ``key: value`` comments.
 
-    Ignores other properties; a missing label is 0 (object), as is a density (not computed). Raises InputError if
+    Ignores other properties; a missing label is 0 (object), a missing density 0 (not computed). Raises InputError if
     truncated, anisotropic, invalid or without a `REQUIRED` property.
     """
     ply = read_table(path, "vertex", REQUIRED)
@@ -121,9 +122,9 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
 
 
 def read_world_splats(path: Path) -> SplatSet:
-    """Read a PLY in metres and world, also where comments omit both.
+    """Read a PLY; comments name no unit but metres, no frame but world.
 
-    Raises as `read_ply` and `check_world`.
+    Raises InputError as `read_ply` and `check_world`.
     """
     splats, comments = read_ply(path)
     check_world(path, comments)
@@ -152,7 +153,7 @@ def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
 
 
 def read_shell(path: Path) -> SplatSet:
-    """Read a shell. Raises as `read_ply`, and InputError for other splats."""
+    """Read a shell. Raises InputError for other splats, or an invalid PLY."""
     splats, comments = read_ply(path)
     refuse_if(
         not SHELL.keys() <= comments.keys(),
@@ -215,7 +216,7 @@ def format_of(path: Path, error: type[SplatCtrlError] = UsageError) -> SplatForm
 
 
 def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
-    """Read any splat file and its comments, as a SplatSet if round and plain.
+    """Read any splat file and its comments, as a SplatSet if isotropic with constant colour.
 
     Raises InputError if missing, truncated, unknown or invalid.
     """
@@ -231,7 +232,8 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 def read_source(path: Path) -> tuple[SplatSet | GaussianSet, Comments, Float64]:
     """Read as `read_splats`, with the centres (N, 3) float64 [m] in the file's precision.
 
-    If float32 would move them, an origin is subtracted, which the comment `ORIGIN` names. Raises as `read_splats`.
+    If float32 would move the centres, an origin is subtracted, which comment `ORIGIN` gives. Raises InputError as
+    `read_splats`.
     """
     if format_of(path, InputError) is not FORMATS[".ply"]:
         splats, comments = read_splats(path)
@@ -258,9 +260,9 @@ def _splats_or_gaussians(ply: PlyFile) -> SplatSet | GaussianSet:
 
 
 def read_spheres(path: Path) -> SplatSet:
-    """Read any splat file as spheres in the world, with constant harmonics.
+    """Read any splat file as spheres in the world, dropping view-dependent colour.
 
-    Raises InputError as `read_splats`, and for splats not round, or in another unit or frame.
+    Raises InputError if invalid, anisotropic, or in another unit or frame.
     """
     if (path.suffix.lower() or ".ply") == ".ply":
         return read_world_splats(path)

@@ -1,6 +1,6 @@
 """Gaussians as OpenUSD particle fields (UsdVol ParticleField3DGaussianSplat, OpenUSD 26.3 and later), in world.
 
-Sigmas and opacities are linear; harmonics go by Gaussian, then coefficient. z is up; units are metres. Needs
+Sigmas and opacities are linear; harmonics are ordered by Gaussian, then coefficient. z is up; units are metres. Needs
 usd-core.
 """
 
@@ -21,14 +21,13 @@ from splatctrl_cli.records import Array, Float32, GaussianSet, Label
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 DEGREE = "radiance:sphericalHarmonicsDegree"
-NAME = "field"  # of the file while the library has it: it goes by the suffix
+NAME = "field"  # of a temporary file: the library goes by the suffix
 
 
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Primvar ``label`` is written if some Gaussian is not an object. Raises InputError for an invalid value, UsageError
-    without the library.
+    Primvar ``label`` is written if some Gaussian is not an object. Raises UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays, kinds = _library()
@@ -64,7 +63,7 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 
 
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
-    """Read a USD file's only particle field, in its own axes, and its data.
+    """Read a USD file's only particle field, and its custom data.
 
     Transforms are not applied. Raises InputError if unreadable or without exactly one field, UsageError without the
     library.

@@ -108,7 +108,7 @@ def is_capture(path: Path) -> bool:
 
 
 def read_capture_header(path: Path) -> dict[str, Any]:
-    """Read capture.json. Raises InputError if not ours, or of another version."""
+    """Read capture.json. Raises InputError if damaged, of another program or another version."""
     file = path / "capture.json"
     with refuse_faults(f"{file}: cannot be read", ValueError, OSError, remedy=AGAIN):
         header: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
@@ -229,7 +229,7 @@ _NOT_FOR_CAPTURES = (
 class CaptureSource(FrameSource):
     """Records of a capture; files with a wrong checksum are damage.
 
-    joints: a robot's, merged from the kept topics; if None, or no topic was kept, the states are joints.npz's.
+    joints: a robot's, merged from the capture's joint topics. Without either, states are those of joints.npz.
     """
 
     def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
@@ -250,7 +250,7 @@ class CaptureSource(FrameSource):
         self._sums = FileSums(path)
         self._rows = FrameRows(path / "frames.csv", self.cameras)
         self._damaged: list[str] = []  # of the last pass
-        self._damaged_before: list[str] = []  # of the pass before it that met most: the last may end early
+        self._damaged_before: list[str] = []  # of the earlier pass with most, as the last may end early
         self._loss = LossReport(**header["loss"])
         described = header.get("joint_topics")
         self.joint_topics = None if described is None else read_topics(path, described, self._checked)

@@ -50,7 +50,7 @@ class Journal:
     """A partial folder's journal: an earlier run's entries, then new ones."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        """identity: the facts that decide the bytes, for a resumed run."""
+        """identity: facts that decide the bytes, compared when a run resumes."""
         self.path = folder / JOURNAL
         self.num_entries = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +94,7 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
         yield from (json.loads(line) for line in stream if line.endswith("\n"))
 
 
-LENSES = "valid/"  # masks that a lens's frames share, out of order
+LENSES = "valid/"  # masks that all frames of a lens share, out of order
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
@@ -112,10 +112,10 @@ def write_capture(
 ) -> tuple[dict[str, Any], int]:
     """Write all of `source` into `folder`, empty or of an interrupted run.
 
-    JPEG and PNG colour with the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded unit,
-    or .npy [m] if none fits. topics: all joint states as recorded, where `source` has one topic's. robot: the log's
-    URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the number of earlier frames.
-    Raises InputError without a frame, UsageError if existing frames differ.
+    JPEG or PNG colour with exactly the frame's pixels is kept byte for byte. Depth becomes 16-bit PNG in its recorded
+    unit, or .npy [m] if counts would not restore it. topics: all joint states as recorded; `source` has those of one
+    topic. robot: the log's URDF, or "". Returns frames by camera, joint_states and loss, as in run.json, and the
+    number of earlier frames. Raises InputError without a frame, UsageError if earlier frames differ.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}

@@ -1,7 +1,7 @@
 """The messages of ROS 1 and ROS 2 (sqlite3) bags; damage is skipped and counted.
 
 A ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is records of named fields and a body. Tables of
-rosbag2_storage_sqlite3: topics, messages, since Iron message_definitions. rosbags refuses a damaged file.
+rosbag2_storage_sqlite3 are topics, messages and, since Iron, message_definitions. rosbags refuses a damaged file.
 """
 
 import os
@@ -36,7 +36,7 @@ Fields = Mapping[str, bytes]
 class Bag1Log(RawLog):
     """One ROS 1 bag, also without its index, which a truncated or growing bag lacks.
 
-    Raises InputError without any record.
+    Raises InputError if no record is whole.
     """
 
     container = "ROS 1 bag"
@@ -55,7 +55,7 @@ class Bag1Log(RawLog):
             self._connect(record.fields, record.content, Damage())
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield in file order; skips bad chunks, reads a cut one to its cut."""
+        """Yield in file order; skip bad chunks, read a cut chunk up to its cut."""
         budget, num_indexed, num_chunks = Budget(self._size), 0, None
         for record in self.records(damage):
             if record.opcode == BAG_HEADER:
@@ -243,8 +243,8 @@ _PAGE_SIZE, _FILE_FORMAT = slice(16, 18), slice(18, 20)  # of its header (sqlite
 class Db3Log(RawLog):
     """One .db3 file, with the journal ("-wal") of a recorder that did not close it.
 
-    SQLite writes while it reads a journal, so both are copied, a cut file up to its last page. Raises InputError for
-    other tables, or an unreadable file.
+    SQLite writes while it reads a journal, so both files are copied, a cut one up to its last whole page. Raises
+    InputError for other tables, or an unreadable file.
     """
 
     container = "ROS 2 bag (sqlite3)"
@@ -294,7 +294,7 @@ class Db3Log(RawLog):
             self._copy(size)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield in written order; rows on damaged pages are skipped and counted."""
+        """Yield messages in written order; rows on damaged pages are skipped and counted."""
         if self._num_pages > 0:
             damage.remark(
                 f"{self.path.name}: was not closed; {self._num_pages} pages of {self._journal.name} were read"

@@ -1,8 +1,8 @@
 """Foxglove's schemas, and the RealSense SDK's texts, as the ROS messages they stand for.
 
-Foxglove's are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet. Fields: docs.foxglove.dev
-("Schemas"); JSON times are {sec, nsec} and bytes base64, protobuf times google.protobuf.Timestamp. The SDK's .db3 has
-intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
+Foxglove's messages are JSON, ROS twins, or protobuf, read by the log's FileDescriptorSet. Fields: docs.foxglove.dev
+("Schemas"). JSON times are {sec, nsec} and bytes base64; protobuf times are google.protobuf.Timestamp. The SDK's .db3
+has intrinsics, extrinsics and depth units as std_msgs/String (librealsense, src/media/ros2/ros2_writer.cpp).
 """
 
 import base64
@@ -43,7 +43,7 @@ def _pool(descriptor_set: bytes) -> Any:
 def read_protobuf(descriptor_set: bytes, type_name: str, data: bytes) -> Any:
     """Decode a message by a FileDescriptorSet; unwritten fields have defaults.
 
-    Raises ValueError for another set, and if the message does not decode.
+    Raises ValueError if the set lacks `type_name`, or the message does not decode.
     """
     with (
         refuse_faults(lambda _: f"the schema does not define {type_name}", KeyError, error=ValueError),
@@ -92,7 +92,7 @@ def find_ros_type(schema: str) -> str:
 
 
 def add_ros_type(topic: Topic) -> Topic:
-    """The topic with its ROS type, if of foxglove_msgs or SDK texts."""
+    """The topic with the ROS type that its foxglove_msgs or SDK texts stand for."""
     texts = _TEXTS if topic.type_name == TEXT else {}
     schema = next((kind for pattern, kind in texts.items() if re.fullmatch(pattern, topic.name)), "")
     ros_type = schema or find_ros_type(topic.type_name)
@@ -100,9 +100,10 @@ def add_ros_type(topic: Topic) -> Topic:
 
 
 def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
-    """Decode `data` to a ROS message; definition: protobuf's FileDescriptorSet, a byte a character.
+    """Decode `data` to a ROS message.
 
-    Raises ValueError, KeyError, TypeError or AttributeError if they do not decode.
+    definition: protobuf's FileDescriptorSet, one byte per character. Raises ValueError, KeyError, TypeError or
+    AttributeError if `data` does not decode.
     """
     return as_ros(
         schema,

@@ -82,7 +82,7 @@ SUFFIXES = tuple(CONTAINERS)
 
 
 class SessionLog(JoinedLog):
-    """Logs recorded at the same time, such as cameras and joints, merged by log time."""
+    """Logs recorded at the same time, merged by log time."""
 
     def __init__(self, parts: tuple[RawLog, ...]) -> None:
         super().__init__(
@@ -94,7 +94,7 @@ class SessionLog(JoinedLog):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield all parts' messages by log time.
 
-        If parts share a topic, all are read, for one order.
+        If parts share a topic, all topics are read, so that `names` do not change the order.
         """
         pushed = None if names is None or self._share(names) else names
         messages = (part.messages(damage, pushed) for part in self._parts)
@@ -114,7 +114,7 @@ class SessionLog(JoinedLog):
 def open_raw_log(path: Path) -> RawLog:
     """Open .mcap, .bag, .db3 or a ROS 2 bag folder, with zstd messages unpacked.
 
-    Raises InputError for others, and unreadable ones.
+    Raises InputError for other or unreadable files.
     """
     if path.is_dir():
         return _open_folder(path)
@@ -227,7 +227,7 @@ _ENDS = 1 << 20  # bytes at either end of a file that are searched for its marks
 class Foreign:
     """An unsupported format: what it is, the remedy, and its marks.
 
-    Marks: name endings, first bytes with a mark near either end, or an entry of a zip file or folder.
+    Marks: a suffix, first bytes with a mark near either end, or an entry of a zip file or folder.
     """
 
     what: str
@@ -279,7 +279,7 @@ FOREIGN = (
 
 
 def refuse_foreign(path: Path) -> None:
-    """Raise InputError for a known unsupported format, with its name and export."""
+    """Raise InputError for a known unsupported format, naming it and a conversion."""
     ends, names = (b"", []) if path.is_dir() else (_ends(path), _entries(path))
     for kind in FOREIGN:
         is_named = path.suffix.lower() in kind.suffixes

@@ -1,7 +1,8 @@
 """The records of an MCAP file from front to back, despite damage, in bounded memory.
 
-An impossible record is skipped, to the summary's next place or the next compressed chunk with consistent lengths. The
-`mcap` package reads a record's fields (mcap.dev/spec); bytes after the last field are allowed, as specified.
+After an impossible record, reading continues at the summary's next place, or the next compressed chunk with
+consistent lengths. The `mcap` package reads a record's fields (mcap.dev/spec); bytes after the last field are
+allowed.
 """
 
 import bisect
@@ -31,7 +32,7 @@ HEAD = struct.Struct("<BQ")  # opcode and length of what follows
 
 class _Fields(ReadDataStream):  # type: ignore[misc]
     def read(self, length: int) -> bytes:
-        """Read exactly `length` bytes. Raises EndOfFile, where the package returns fewer."""
+        """Read exactly `length` bytes. Raises EndOfFile where the package returns fewer."""
         content: bytes = super().read(length)
         if len(content) < length:
             raise EndOfFile
@@ -94,7 +95,7 @@ class McapFile:
         self.size = path.stat().st_size
 
     def parts(self, damage: Damage, *, is_known: bool = False) -> Iterator[Part]:
-        """Yield records in order; losses and faults go to `damage`, checksums included.
+        """Yield records in order; losses and faults, wrong checksums included, go to `damage`.
 
         is_known: skip checksums that were compared before.
         """
@@ -127,7 +128,7 @@ class McapFile:
         return sorted(indexes, key=lambda index: index.chunk_start_offset)
 
     def chunk_at(self, index: ChunkIndex) -> bytes:
-        """A chunk record's content, or what a shorter file has of it."""
+        """Content of a chunk record, cut short where the file ends."""
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
@@ -219,7 +220,7 @@ class _Walk:
         return None
 
     def _chunks_in(self, block: bytes, base: int) -> Iterator[int]:
-        """Yield chunks with consistent lengths in `block` (the file from `base`)."""
+        """Yield where chunks with consistent lengths begin in `block`, the file from byte `base`."""
         for name in _COMPRESSIONS:
             at = block.find(name)
             while at >= 0:

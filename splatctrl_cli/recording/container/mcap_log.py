@@ -1,6 +1,6 @@
-"""An MCAP file's messages by its own records, and its index without a full read.
+"""An MCAP file's messages, and its index without a full read.
 
-Damage is skipped and counted. The `mcap` package allocates what records announce, and needs a summary.
+Damage is skipped and counted. The `mcap` package allocates the sizes that records announce, and needs a summary.
 """
 
 import struct
@@ -38,11 +38,11 @@ MOST_HEADS = 100_000  # records that are visited: a second or so
 
 
 LogIndex = tuple[dict[int, int], tuple[int, int], tuple[ChunkIndex, ...], tuple[str, ...]]
-"""Messages by channel, first and last log time [ns], chunks in file order, and what is missing, in words."""
+"""Number of messages by channel, first and last log time [ns], chunks in file order, notes on missing parts."""
 
 
 def index_by_heads(file: McapFile) -> LogIndex:
-    """Index without a summary, up to damage or MOST_HEADS records."""
+    """Index a file without a summary, up to damage or MOST_HEADS records."""
     counts: dict[int, int] = {}
     chunks: list[ChunkIndex] = []
     stamps: list[int] = []
@@ -104,7 +104,7 @@ class McapLog(RawLog):
         self._statistics: Statistics | None = None
         self._budget = Budget(self._file.size)
         self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
-        for part in self._file.summary():  # so that a damaged chunk hides no channel of others
+        for part in self._file.summary():  # so that a damaged chunk hides no other chunk's channels
             if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
                 self._declare(part.opcode, part.content, Damage())
 
@@ -120,9 +120,9 @@ class McapLog(RawLog):
         )
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; skips damage, reads a cut chunk to its cut.
+        """Yield in file order; skip damage, read a cut chunk up to its cut.
 
-        Checksums are compared until one full pass is right.
+        Checksums are compared until one full pass finds no damage.
         """
         self._budget = Budget(self._file.size)
         state, count = self._forget_changed(), damage.count

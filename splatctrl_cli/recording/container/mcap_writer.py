@@ -2,7 +2,7 @@
 
 ROS 2 (CDR, zstd chunks, CRCs on). Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info,
 /CAM/depth/image_raw (16UC1 millimetres, REP 118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a
-person), /joint_states, /tf, /tf_static. No wall-clock time in the bytes.
+person), /joint_states, /tf, /tf_static. The bytes contain no wall-clock time.
 
 Foxglove: protobuf (docs.foxglove.dev, "Schemas"), with plots in JSON; needs foxglove-schemas-protobuf and
 mcap-protobuf-support.
@@ -210,7 +210,7 @@ class FoxgloveLog:
     def add_voxels(
         self, topic: str, stamp_ns: int, name: str, values: NDArray[Any], origin: Float64, voxel: float
     ) -> None:
-        """Add (X, Y, Z), uint8 or float32, centred from `origin` (3,) [m] on."""
+        """Add voxels (X, Y, Z), uint8 or float32; `origin` (3,) [m]: centre of the first."""
         columns, rows, _ = values.shape
         size = values.dtype.itemsize
         message = _new(

@@ -16,8 +16,8 @@ class Topic:
     """A channel of a log.
 
     type_name: ``package/msg/Type`` for ROS. encoding: ``cdr``, ``ros1`` or the file's (json, protobuf, ...).
-    definition: the type's text or "", as definition_format ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a
-    byte a character). schema: the original type if type_name stands for it in ROS, else "".
+    definition: the type's text or "". definition_format: ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, one
+    byte per character). schema: the original type if type_name stands for it in ROS, else "".
     """
 
     name: str
@@ -32,7 +32,7 @@ class Topic:
 class RawMessage:
     """A message: topic, log time [ns] and bytes, the same for every container.
 
-    file, offset: the byte where its record, or its chunk's, begins; -1 if unknown.
+    file, offset: file name, and byte where the message's record or chunk begins; -1 if unknown.
     """
 
     topic: Topic
@@ -56,7 +56,8 @@ class Part(NamedTuple):
 class Damage:
     """Losses of a pass over a log.
 
-    remarks: counts of what is no damage, such as unsupported forms. num_invalid: depth pixels that measure nothing.
+    remarks: counts of deviations without loss, such as unsupported forms. num_invalid: depth pixels that measure
+    nothing.
     """
 
     count: int = 0
@@ -75,7 +76,7 @@ class Damage:
             self.notes[MAX_NOTES:] = [f"and {self._num_unsaid} more"]
 
     def remark(self, text: str) -> None:
-        """Count what is no damage; after MAX_NOTES, new remarks share one."""
+        """Count a deviation without loss; after MAX_NOTES, new remarks share one."""
         is_room = text in self.remarks or len(self.remarks) < MAX_NOTES
         self.remarks[text if is_room else "more of this kind"] += 1
 
@@ -87,7 +88,7 @@ class Damage:
 class RawLog:
     """A log that can be read repeatedly.
 
-    container: the kind of file in words, such as ``MCAP``, ``ROS 1 bag``. channels: declared topics by number.
+    container: the kind of file, such as ``MCAP`` or ``ROS 1 bag``. channels: declared topics by number.
     """
 
     path: Path
@@ -105,7 +106,10 @@ class RawLog:
 
 
 class JoinedLog(RawLog):
-    """Logs read in turn, messages changed; `note`, a fault of all, counts as damage."""
+    """Logs read one after another; `note`, a fault of all, counts as damage.
+
+    change: edits the messages.
+    """
 
     def __init__(
         self,

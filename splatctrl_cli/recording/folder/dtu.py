@@ -1,8 +1,8 @@
-"""DTU scans in MVSNet's layout: reads real ones, writes ours.
+"""Reader and writer of DTU scans in MVSNet's layout.
 
 ROOT/Cameras/[train/]00000000_cam.txt (world-to-camera and K), ROOT/Cameras/pair.txt,
 ROOT/Rectified/SCAN_train/rect_001_3_r5000.png (view 0, light 3), ROOT/Depths_raw/SCAN/depth_map_0000.pfm with
-depth_visual_0000.png (above 10 where depth is valid). Lengths there are millimetres, here metres.
+depth_visual_0000.png (above 10 where depth is valid). Lengths are millimetres in files, metres in memory.
 """
 
 import re
@@ -46,7 +46,7 @@ Shrink = Callable[[DtuView], DtuView]
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """A scan's views, their numbers, files read, and names without_depth."""
+    """A scan's views, their numbers, files read, and names of images without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
@@ -60,8 +60,8 @@ def read_dtu(
 ) -> DtuScan:
     """Read scan `scan` (default: the only one) of a DTU folder; `masks` has NNN.png.
 
-    `shrink` maps each view before the next is read. K is scaled to the images (the file's may be for 1600x1200 or a
-    quarter). Depth of another size is sampled, not blended. Drops views without depth. Raises InputError naming the
+    `shrink` maps each view before the next is read. K is scaled to the images, as it may be for 1600x1200 or a
+    quarter. Depth of another size is sampled, not blended. Drops views without depth. Raises InputError naming the
     file.
     """
     scan, folder = choose_scan(root, scan_folders(root), scan)
@@ -109,7 +109,7 @@ def read_views(
     shrink: Shrink,
     keeps_without_depth: bool,
 ) -> DtuScan:
-    """Read views by number, one at a time before `shrink`.
+    """Read views by number; `shrink` maps each before the next is read.
 
     A view without a depth file has depth 0 if `keeps_without_depth`, else it is left out. camera: intrinsics and
     T_world_camera by number and (width, height).
@@ -222,7 +222,7 @@ def read_image(path: Path) -> UInt8:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
-    """(H, W) True where bright in every channel, by nearest pixels."""
+    """Mask (H, W), True where bright in every channel, by nearest pixels."""
     image = read_image(path)
     if image.shape[1::-1] != size:
         width, height = size
@@ -251,7 +251,7 @@ def _camera_file(root: Path, number: int) -> Path:
 def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
     """Read K (3, 3) [px], T_camera_world (4, 4) and least depth of MVSNet's file.
 
-    Lengths have the file's unit; depth 0 is none.
+    Lengths have the file's unit; depth 0: not given.
     """
     words = path.read_text(encoding="utf-8", errors="replace").split()
     with refuse_faults(
@@ -271,10 +271,11 @@ def read_camera_file(path: Path) -> tuple[Float64, Float64, float]:
 
 
 def fit_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
-    """Fit K to an image of `size` (width, height), whichever common size it is for.
+    """Fit K, of one of the common sizes, to an image of `size` (width, height).
 
-    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves it to (u + 0.5) scale -
-    0.5, as in `shrink_view`. MVSNet's cameras for 640x512, and for a quarter, are multiples of those for 1600x1200.
+    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). Shrinking moves u to (u + 0.5) scale -
+    0.5, as in `shrink_view`. MVSNet's K for 640x512, and for a quarter, are multiples of that for 1600x1200, without
+    this shift.
     """
     width, height = size
     ratio = width / RAW[0]

@@ -47,7 +47,7 @@ class CameraTable:
 
 @dataclass(frozen=True, kw_only=True)
 class FramesTable:
-    """``[frames]``: globs with one ``*``; files with equal text for it belong together.
+    """``[frames]``: globs with one ``*``; files with the same text for ``*`` belong together.
 
     human_mask: 8-bit grey, not 0 on a person.
     """
@@ -79,7 +79,7 @@ class PosesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class StampsTable:
-    """``[stamps]``: rate [1/s] of frame numbers; names: as seconds."""
+    """``[stamps]``: rate [1/s] of frame numbers; names: True if names are seconds."""
 
     rate: float | None = None
     names: bool = False
@@ -96,7 +96,7 @@ class SplitTable:
 class ImagePart:
     """An image inside a file, used like an image file's path.
 
-    number: its index; size: (columns, rows); read_bytes: an image file of that suffix, empty if damaged.
+    number: its index. size: (columns, rows). read_bytes: returns an image file of `suffix`, empty if damaged.
     """
 
     file: Path
@@ -125,7 +125,7 @@ def whole_file(image: ImageFile) -> Path:
 class ListedView:
     """A view by its files, for layouts that list them.
 
-    depth: None if no view has any. matrix: pose as written, or None. camera: None for [camera]. depth_scale: metres
+    depth: None if no view has any. matrix: pose as written, or None. camera: None for [camera]'s. depth_scale: metres
     per count, None for [depth]'s. valid: 8-bit grey, 0 on invalid pixels, or None.
     """
 
@@ -142,7 +142,7 @@ class ListedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A whole description; transforms.json may give camera and frames, --camera-pose the poses.
+    """A description; transforms.json may give camera and frames, --camera-pose the poses.
 
     listed: a layout's views, instead of frames. is_depth_resized: to colour, by nearest pixels. unpaired: colour and
     depth files without partner. num_damaged: views lost to damage. supply: how to add depth if no view has it. notes:
@@ -196,7 +196,7 @@ def read_table(
 ) -> T:
     """Read table [name] of a TOML file; `fill` adds keys left out.
 
-    Raises as `read_description`.
+    Raises InputError for a wrong key.
     """
     content = _content(path)
     _check_keys(content, {name, *others}, str(path), "")
@@ -211,10 +211,10 @@ def has_table(path: Path, name: str) -> bool:
 
 
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
-    """A description per ``[[cameras]]``; empty without them.
+    """A description per ``[[cameras]]`` table; empty without any.
 
-    Keys are [camera]'s, and `color`, `depth`, `poses` for files; the rest is common. Raises as `read_description`,
-    and for shared or missing names.
+    Keys are those of [camera], and `color`, `depth`, `poses` for files; other tables are common. Raises InputError
+    for a wrong key, and a shared or missing name.
     """
     content = _content(path)
     cameras = content.pop("cameras", [])
@@ -260,7 +260,7 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
     _check_keys(content, known, str(path), "")
     with refuse_faults(
         lambda _: f"{path}: root: no home folder of {content.get('root')}", RuntimeError, remedy="give --root"
-    ):  # ~ of a person who is not here
+    ):  # ~ of an unknown user
         folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
     refuse_if(not folder.is_dir(), f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
     description = Description(

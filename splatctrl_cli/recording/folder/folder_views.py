@@ -37,8 +37,7 @@ UNITS = {MILLIMETRE: "millimetres", 0.01: "centimetres"}  # [m] of each, the lik
 class View:
     """A pair of files with an optional mask; name is the text of `*`.
 
-    camera: its name, or HOLDOUT. lens: its actual camera. depth_scale: metres per count. valid: mask of usable
-    pixels.
+    camera: its name, or HOLDOUT. lens: its camera. depth_scale: metres per count. valid: mask of usable pixels.
     """
 
     name: str
@@ -53,16 +52,16 @@ class View:
     valid: Path | None = None
 
     def convert(self, metres: float) -> "View":
-        """Scale pose and depth to metres; metres: per length of the recording."""
+        """Scale pose and depth to metres; metres: per unit of the recording."""
         T = self.T_world_camera.copy()
         T[:3, 3] *= metres
         return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
 
 
 def length_unit(median: float, apart: float) -> float:
-    """Metres per length of a recording with this median depth and camera distance.
+    """Metres per unit of a recording, by its median depth and its cameras' distance.
 
-    1 unless depth is too large for metres and the cameras have the same unit.
+    1 unless the depth is too large for metres, and the cameras' distance has the same unit.
     """
     if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
         return 1.0
@@ -74,7 +73,7 @@ def length_unit(median: float, apart: float) -> float:
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
     """Views sorted by stamp; losses are counted in `loss`.
 
-    Raises InputError if none is left, or all are held out (UsageError if by --holdout).
+    Raises InputError if no view is left, or all are held out (UsageError if by --holdout).
     """
     listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
@@ -155,7 +154,7 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
 
 
 def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:
-    """Files sorted by the text of `*`; without it one file, with empty text."""
+    """Pairs (text of `*`, file) in order of paths; without `*`, one file with empty text."""
     if "*" not in pattern:
         return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))

@@ -1,9 +1,9 @@
 """DTU scans in the layout of IDR and NeuS; scans as training and held-out records.
 
 SCAN/cameras_sphere.npz (or cameras.npz) has world_mat_I, the projection (4, 4) of world points to pixels of image I,
-and scale_mat_I, the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the I-th
-by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. Lengths there are millimetres, here
-metres. SCAN/depth may have depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
+and scale_mat_I, from the object's unit sphere to the world; SCAN/image/000000.png; SCAN/mask/000.png. Image I is the
+I-th by name (Totoro97/NeuS, models/dataset.py), or by number if some are missing. Lengths are millimetres in files,
+metres in memory. SCAN/depth may have depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
 """
 
 import re
@@ -79,9 +79,9 @@ def read_idr(
 
 
 def write_idr(root: Path, scan: str, views: Sequence[DtuView]) -> Path:
-    """Write views as one scan folder, with their masks; returns it.
+    """Write views and masks as one scan folder; return it.
 
-    The object's sphere is nearest to the cameras' axes, with half the nearest camera's distance.
+    The object's sphere is centred nearest to the cameras' axes; its radius is half the nearest camera's distance.
     """
     folder = root / scan
     (folder / "image").mkdir(parents=True)
@@ -113,7 +113,7 @@ def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
     """Centre (3,) and radius [mm]."""
     centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
     axes = np.array([view.T_world_camera[:3, 2] for view in views])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # the part of a vector across the axis
     middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
     return middle, 0.5 * float(np.linalg.norm(centers - middle, axis=1).min())
 
@@ -121,8 +121,8 @@ def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
 def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
     """Split P (3, 4) of world points [mm] into K (3, 3) and T_world_camera (4, 4) [m].
 
-    P = s K [R | t] with K[2, 2] = 1 and any scale s, even negative; the camera is where P is 0. Raises InputError if
-    P is no camera.
+    P = s K [R | t] with K[2, 2] = 1 and any scale s, even negative; the camera's centre is where P is 0. Raises
+    InputError if P is no camera.
     """
     M = P[:, :3]
     determinant = np.linalg.det(M)
@@ -208,8 +208,9 @@ class DtuSource:
     """A scan's views by number (view 0 is ``rect_001``), which is also the stamp.
 
     The scene is static, without a clock. Views in `holdout` belong to camera ``holdout``, others to ``camera``,
-    unless a `protocol` assigns or drops them. masks, depths: folders, if elsewhere. downscale: shrink factor; None:
-    to the protocol's size, if a whole factor. layout: ``MVSNet`` or ``IDR``; split: training and held-out views.
+    unless a `protocol` assigns or drops them. masks, depths: folders outside the scan. downscale: shrink factor;
+    None: to the protocol's size, if by a whole factor. layout: ``MVSNet`` or ``IDR``. split: training and held-out
+    views.
     """
 
     joint_names: tuple[str, ...] = ()
@@ -298,7 +299,7 @@ class DtuSource:
 
 
 def shrink_view(view: DtuView, factor: int) -> DtuView:
-    """Merge every `factor` x `factor` pixels: mean colour, the middle's depth, the first's mask.
+    """Merge every `factor` x `factor` pixels: mean colour, middle pixel's depth, first pixel's mask.
 
     Colour and mask follow RegNeRF (regnerf/internal/datasets.py, downsample). Pixel (0, 0) has its centre at (0, 0):
     u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.

@@ -75,7 +75,7 @@ class ImageFolderSource(FrameSource):
         self._views = list(heapq.merge(*of_each, key=lambda view: view.stamp_ns))
         self._lenses: dict[str, Lens] = {}
         self.guess = "" if self.has_clock else self._convert_to_metres()
-        """In which unit lengths look to be, in words; empty where they may be metres."""
+        """Unit that lengths seem to have, in words; empty if they may be metres."""
         refuse_unknown_cameras(
             path, (*options.camera_poses, *options.intrinsics), sorted({view.lens.name for view in self._views})
         )
@@ -306,8 +306,8 @@ def open_image_folder(path: Path, options: SourceOptions) -> ImageFolderSource:
     )
 
 
-_COLORS = ("images", "image", "rgb", "color")  # where folders of colour alone keep it
-_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one
+_COLORS = ("images", "image", "rgb", "color")  # folders of images in a folder without depth
+_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # entries of an unknown folder
 
 LAYOUTS = entries_of(__package__, Layout)
 
@@ -319,7 +319,7 @@ def layout_of(path: Path) -> Layout | None:
 
 
 def has_views(path: Path) -> bool:
-    """True for a folder but a ROS 2 bag, or a layout's file."""
+    """True for a folder that is no ROS 2 bag, and for a layout's file."""
     return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 

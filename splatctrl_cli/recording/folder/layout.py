@@ -34,8 +34,8 @@ _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 class Layout:
     """A dataset layout, in its module's ``ENTRIES``.
 
-    The lowest matching `order` wins; a file with `suffix` is one by itself. `docs`: rows in docs/input.md, cells
-    between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
+    order: the lowest that matches is used. suffix: of a file that is a dataset by itself. docs: rows of
+    docs/input.md, cells between bars, an empty line between rows: layout, marks, poses, depth, intrinsics.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Layout:
 
 
 def find_marks(*alternatives: str) -> Callable[[Path], bool]:
-    """Make a test of folders: every name of one alternative ("/": a folder)."""
+    """Make a test of folders: all marks of one alternative are there ("X/": a folder)."""
 
     def has(folder: Path, mark: str) -> bool:
         return any(path.is_dir() if mark.endswith("/") else path.is_file() for path in folder.glob(mark))
@@ -69,9 +69,9 @@ def ask_description(name: str, *examples: str) -> Callable[[Path, SourceOptions]
 
 
 def add_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> CameraTable:
-    """A lens's camera, of those known or added to them as ``camera``, ``camera-1``, ``camera-2``, ...
+    """The known camera equal to `table`, else `table`, added as ``camera``, ``camera-1``, ...
 
-    Raises as `check_camera`.
+    Raises InputError if it is impossible.
     """
     for known in lenses:
         if asdict(replace(known, name=table.name)) == asdict(table):
@@ -82,7 +82,7 @@ def add_lens(lenses: list[CameraTable], table: CameraTable, where: str) -> Camer
 
 
 def list_views(path: Path, views: Sequence[ListedView], num_colors: int, num_depths: int) -> Description:
-    """Describe the views of so many colour and depth files. Raises InputError without a view."""
+    """Describe views of `num_colors` and `num_depths` files. Raises InputError without a view."""
     refuse_if(not views, f"{path}: no colour image has a depth image", remedy=_WHOLE)
     unpaired = (num_colors - len(views), num_depths - len(views))
     return Description(path=path, root=path, poses=None, listed=tuple(views), unpaired=unpaired)
@@ -127,7 +127,7 @@ def describe(
 ) -> Description:
     """Complete listed views with the lens of --intrinsics, else `lens` of the first image.
 
-    Without `lens` each view has one. Raises InputError if a camera is impossible.
+    Without `lens`, each view has its own. Raises InputError if a camera is impossible.
     """
     first = pairs.listed[0]
     camera = first.camera if lens is None else lens_option(options, first.color) or lens(first.color)

@@ -1,13 +1,13 @@
 """Layouts with a lens per image: ARKitScenes, BOP scenes, and MVSNet scenes.
 
 ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/``, ``lowres_wide.traj``. Images are named
-by video and seconds; depth in millimetres; an image's ``.pincam`` has width, height, fx, fy, cx, cy. Trajectory lines
-are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes, DATA.md, and
-threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
+by video and seconds; depth is in millimetres; an image's ``.pincam`` has width, height, fx, fy, cx, cy. Trajectory
+lines are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes,
+DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
 
-BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``. Per image: cam_K by rows [px], depth_scale counts to
-millimetres, cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit, docs/bop_datasets_format.md). PNG, JPEG
-or TIFF. Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
+BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``, in PNG, JPEG or TIFF. Per image: cam_K by rows [px],
+depth_scale (counts to millimetres), cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit,
+docs/bop_datasets_format.md). Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
 
 MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, optional depth (.pfm). A camera file is the world-to-camera
 matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (README, "File Formats") or ``DEPTH_MIN
@@ -109,7 +109,7 @@ def _arkit_lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
     assert view.stamp_ns is not None
     stamp_ns = view.stamp_ns
     near = min(pincams, key=lambda stamp: abs(stamp - stamp_ns), default=None)
-    if near is None or abs(near - stamp_ns) > 5_000_000:  # the two names are rounded apart
+    if near is None or abs(near - stamp_ns) > 5_000_000:  # the two names are rounded separately
         raise InputError(
             f"{view.color}: no .pincam of its stamp in lowres_wide_intrinsics",
             remedy="download lowres_wide_intrinsics",
@@ -207,11 +207,11 @@ def _pose(entry: dict[str, Any]) -> Float64 | None:
 
 _CAMERAS = "cams/*_cam.txt"
 _NO_DEPTH = ("prob", "conf")  # in the names of maps beside depth
-_ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth, which stands behind a measured one
+_ESTIMATED = ("est", "mvsnet")  # in the names of folders with a network's depth, used only without a measured one
 
 
 def read_mvsnet(folder: Path, options: SourceOptions) -> Description:
-    """Describe the folder, a lens per K; --depth-scale is metres per length."""
+    """Describe the folder, a lens per K; --depth-scale: metres per unit."""
     options.refuse(("intrinsics",), "an MVSNet scene", folder)
     files = {path.name.removesuffix("_cam.txt"): path for path in sorted(folder.glob(_CAMERAS))}
     cameras = {stem: read_camera_file(path) for stem, path in files.items()}

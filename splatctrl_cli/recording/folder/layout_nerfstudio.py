@@ -3,8 +3,8 @@
 Fields, defaults and axes (OpenGL): nerfstudio's documentation ("Data conventions"),
 nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py. Masks are 0 on invalid pixels;
 depth of another size is resized by nearest pixels; ``applied_scale`` is undone. instant-ngp has ``depth_path``,
-``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; its default centre is the image's
-(NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
+``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``; its default principal point is the image's
+centre (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
 """
 
 import math

@@ -1,8 +1,8 @@
 """Organised PCL point clouds: a ``.pcd`` with a point per pixel, or a folder.
 
 Format: PCL's tutorial "The PCD file format" (v0.7), read by pypcd4 (extra `pcd`). Intrinsics follow from the grid:
-column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in the camera (z forward) or world,
-whichever fits.
+the point of column u, row v is on that pixel's ray. VIEWPOINT is the camera's pose; points are in camera (z forward)
+or world coordinates, whichever fits.
 """
 
 import struct
@@ -34,7 +34,7 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Intrinsics, UInt8
 
 SUFFIX = ".pcd"
-_UNSET = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # VIEWPOINT where nobody set it
+_UNSET = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # VIEWPOINT that is not set
 _MOST_LINES = 32  # of a header
 _FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _DAMAGE = (ValueError, TypeError, KeyError, RuntimeError, OSError, MemoryError, struct.error)
@@ -47,7 +47,7 @@ _library = partial(import_extra, "pypcd4", "pcd", "point clouds (.pcd)")
 def read_cloud(path: Path) -> tuple[Float64, UInt8, Float64]:
     """Points (H, W, 3), NaN for none, colour (H, W, 3) RGB, and VIEWPOINT of an organised cloud, as written.
 
-    Raises InputError for another.
+    Raises InputError if damaged or not organised.
     """
     head = _head(path)
     size = (head.height, head.width)
@@ -77,7 +77,7 @@ def pinhole_of(points: Float64) -> Intrinsics | None:
 
 
 def residual(points: Float64, camera: Intrinsics | None) -> float:
-    """95th percentile [px] of points (H, W, 3) from their pixels; inf without a camera."""
+    """95th percentile [px] between points (H, W, 3), projected, and their pixels; inf without a camera."""
     valid = _is_seen(points)
     if camera is None or not valid.any():
         return float("inf")
@@ -86,7 +86,7 @@ def residual(points: Float64, camera: Intrinsics | None) -> float:
 
 
 def read(path: Path, options: SourceOptions) -> Description:
-    """Describe clouds; --depth-scale is metres per length of points and VIEWPOINT."""
+    """Describe clouds; --depth-scale: metres per unit of points and VIEWPOINT."""
     files = [path] if path.is_file() else sorted(path.glob(f"*{SUFFIX}"), key=lambda p: number_key(p.stem))
     heads, unit = [_head(file) for file in files], options.depth_scale or 1.0
     k, is_world, notes = _fit_lens(files[0], options)
@@ -216,7 +216,7 @@ def _color_file(path: Path) -> bytes:
 
 
 def _depth_file(path: Path, camera: Intrinsics, first: Path, *, is_world: bool) -> bytes:
-    """Depth in the cloud's length, 0 for none, as .npy, empty if unreadable.
+    """Depth in the cloud's unit as .npy, 0 = none; empty bytes if unreadable.
 
     Raises InputError if the camera is not the first cloud's.
     """

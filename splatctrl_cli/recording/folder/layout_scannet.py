@@ -1,7 +1,7 @@
 """ScanNet's sensor files: ``X.sens`` of version 4, alone or in its folder.
 
 Layout of ScanNet's SensReader (python/SensorData.py, c++/src/sensorData.h), little-endian: version (uint32), name
-(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth). Storage of colour and
+(uint64 and text), four 4x4 float32 matrices (intrinsics and extrinsics of colour, then depth); storage of colour and
 depth (two int32), their sizes (four uint32), counts per metre (float32), number of frames (uint64). A frame: camera
 to world (16 float32, -inf if lost), stamps of colour and depth [us] and lengths of both images (four uint64), the
 images. IMU data follows, and is skipped.
@@ -56,9 +56,9 @@ _AGAIN = "copy the file again"
 
 @dataclass(frozen=True, kw_only=True)
 class _Sens:
-    """The head: lenses of both cameras (4, 4) [px], and poses in the rig's base.
+    """The head: both cameras' intrinsics (4, 4) [px] and poses in the rig's base.
 
-    depth_scale: metres per count. is_packed: depth is zlib. first: the frames' offset.
+    depth_scale: metres per count. is_packed: depth is zlib. first: byte of the first frame.
     """
 
     color: Float64

@@ -1,17 +1,17 @@
 """Room scenes with a trajectory or a pose per frame: 7-Scenes, Open3D, Redwood, Replica.
 
 7-Scenes and its kin: ``frame-NNNNNN.color.*``, ``.depth.*``, ``.pose.txt``, in one folder, ``seq-NN/``, ``data/``.
-Depth in millimetres, 65535 for none; poses camera to world. Three calibrations:
+Depth is in millimetres, 65535 = none; poses are camera to world. Three calibrations:
 
 - ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan): the user describes the folder;
-- ``camera-intrinsics.txt``, one 3x3 matrix for both (3DMatch, Zeng et al., CVPR 2017);
-- none: 7-Scenes publishes the depth camera's 585, 585, 320, 240 and poses; colour is not registered (Shotton et al.,
-  CVPR 2013, and the dataset's page). Colour is a Kinect's of focal length 525, placed by another Kinect's
-  calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' Kinect calibration).
+- ``camera-intrinsics.txt``, one 3x3 matrix for colour and depth (3DMatch, Zeng et al., CVPR 2017);
+- none: 7-Scenes publishes the depth camera's intrinsics 585, 585, 320, 240 and poses; colour is not registered
+  (Shotton et al., CVPR 2013, and the dataset's page). Colour gets a Kinect's focal length 525, and its pose from
+  another Kinect's calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' calibration).
 
 Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_intrinsic.json``, named as in
 open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
-world (examples/python/reconstruction_system/integrate_scene.py). Images match them in natural order
+world (examples/python/reconstruction_system/integrate_scene.py). Images match poses in natural order
 (open3d_example.py, get_rgbd_file_lists), or by number if their counts differ.
 """
 
@@ -151,7 +151,7 @@ def read_redwood(folder: Path, options: SourceOptions) -> Description:
 
 
 def _pairs(colors: list[str], depths: list[str]) -> list[tuple[str, str]]:
-    """Pair equal names; else all in order; else equal first numbers."""
+    """Pair by equal names; else in order if as many; else by first numbers."""
     same = [(name, name) for name in colors if name in depths]
     if same or len(colors) == len(depths):
         return same or list(zip(colors, depths, strict=True))

@@ -138,9 +138,9 @@ def read_numbers(path: Path) -> list[float]:
 
 
 def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 | None]:
-    """A camera's T_world_camera (4, 4) at any stamp [ns], None where unknown.
+    """Function from stamp [ns] to a camera's T_world_camera (4, 4), None where unknown.
 
-    It interpolates poses by stamp [s, as text].
+    It interpolates `poses`, by stamp [s, as text].
     """
     tree, known, lost = TfTree(), list[int](), list[int]()
     for text, T in poses.items():
@@ -163,7 +163,7 @@ def trajectory(poses: Mapping[str, Float64 | None]) -> Callable[[int], Float64 |
 
 
 def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
-    """Nanoseconds of a time in units of `unit_ns`, unrounded; None if no time."""
+    """Nearest nanosecond of a time in units of `unit_ns`; None if no time."""
     try:
         stamp_ns = Decimal(text) * unit_ns
         return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits

@@ -1,7 +1,7 @@
 """A log's RGB-D cameras, and their poses from messages instead of tf.
 
-Poses: nav_msgs/Odometry (child_frame_id in header.frame_id), geometry_msgs/PoseStamped, PoseWithCovarianceStamped and
-TransformStamped.
+Poses: nav_msgs/Odometry (of child_frame_id in header.frame_id), geometry_msgs/PoseStamped, PoseWithCovarianceStamped
+and TransformStamped.
 """
 
 import re
@@ -40,9 +40,9 @@ _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
 
 def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
-    """Topics whose first image is color, depth, other or ``unlike``.
+    """Topics whose first image is of `kind`: color, depth, other or ``unlike``.
 
-    ``unlike``: the name contradicts the image, such as 16-bit infrared.
+    ``unlike``: the name contradicts the image, as for 16-bit infrared.
     """
     topics = [(t, t.first_image) for t in survey.select_types(IMAGE, COMPRESSED_IMAGE)]
     return [t for t, image in topics if image is not None and kind == ("unlike" if _unlike(t) else image.kind)]
@@ -60,7 +60,7 @@ def _unlike(topic: TopicSurvey) -> str:
 def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
     """Pair colour and depth topics that share a namespace, deepest first, into named cameras.
 
-    Prefers registered depth, colour to grey, rectified to raw, uncompressed images.
+    Prefers registered depth, colour over grey, rectified over raw, and uncompressed images.
     """
     colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
     depths = image_topics(survey, "depth")
@@ -117,7 +117,8 @@ def _family(name: str) -> tuple[str, ...]:
 def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
     """The CameraInfo topic of an image topic, "" if none.
 
-    It shares more path than the namespace, is in either's folder, or has the image's frame and size.
+    It shares more path with the image than `namespace`, is in the image's folder or the namespace's, or has the
+    image's frame and size.
     """
     folder, its = _parts(image.topic.name)[:-1], image.first_image
     view = ("", 0, 0) if its is None else (its.frame_id, its.width, its.height)
@@ -136,7 +137,7 @@ def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | N
 
 
 def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
-    """True if depth is on colour pixels: equal size, frame (or name), K and distortion."""
+    """True if depth is on colour pixels, by size, frame (or topic name), K and distortion."""
     color_image, depth_image = survey.topics[color].image, survey.topics[depth].image
     is_other_size = (color_image.width, color_image.height) != (depth_image.width, depth_image.height)
     T_color_depth = survey.realsense.T_between(color, depth)
@@ -161,7 +162,7 @@ def _same_distortion(one: Calibration, two: Calibration) -> bool:
 
 
 def frame_of(survey: Survey, color: str, depth: str) -> str:
-    """The colour images' frame; a video file takes its depth's."""
+    """Frame of the colour images; for a video file, of the depth images."""
     return survey.topics[depth if _is_of_file(survey.topics[color]) else color].image.frame_id
 
 
@@ -309,11 +310,11 @@ StampedPose = tuple[str, str, int, Float64, Float64]
 def join_pose_topics(
     log: RawLog, survey: Survey, options: SourceOptions, cameras: Sequence[CameraTopics], *, only_first: bool = False
 ) -> None:
-    """Add pose topics to a survey's tf tree; those used unasked are noted.
+    """Add poses from topics to a survey's tf tree.
 
-    Options name topics by camera. Otherwise an odometry is used if tf misses its child, a camera's frame, or if its
-    parent is the world frame. only_first: one pose, enough to see connections. Raises InputError if a topic cannot
-    place its camera, or several odometries could.
+    Options name topics by camera. Without these, an odometry is used, with a note, if tf misses its child, a camera's
+    frame, or its parent, the world frame. only_first: one pose, enough to see connections. Raises InputError if a
+    topic cannot place its camera, or several odometries place one frame.
     """
     frames = {camera.name: survey.topics[camera.color].image.frame_id for camera in cameras}
     by_camera = {name: pose_topic for name, pose_topic in options.camera_pose_topics.items() if name in frames}

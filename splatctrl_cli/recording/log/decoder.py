@@ -1,9 +1,9 @@
 """Decoded messages of the standard types, by the definitions in the log; and RealSense extras.
 
 RealSense bags have extrinsics and depth units on ``/device_D/sensor_S/STREAM_N/...`` (librealsense,
-src/media/ros/ros_file_format.h). ``tf/R`` maps points of group R's reference stream to this stream: T_color_depth =
+src/media/ros/ros_file_format.h). ``tf/R`` maps points of group R's reference stream to STREAM_N: T_color_depth =
 T_color_R T_R_depth (docs/formats.md). In newer bags (2.5x) an image's frame is "1", and a little-endian float32
-follows the message: metres per count of depth, 0 for others (src/media/ros/ros_writer.cpp).
+follows the message: metres per count of depth, 0 for other images (src/media/ros/ros_writer.cpp).
 """
 
 import re
@@ -51,7 +51,7 @@ class UndecodableMessageError(ValueError):
 
 
 class UnreadFormError(UndecodableMessageError):
-    """A message of an unread or refused form, perhaps whole."""
+    """A message of an unread or refused form, perhaps undamaged."""
 
 
 def is_ros(topic: Topic) -> bool:
@@ -63,7 +63,7 @@ def is_foxglove(topic: Topic) -> bool:
 
 
 class MessageDecoder:
-    """A decoder with a store per definition: a bad one spoils no other topic."""
+    """A decoder with type definitions by topic: an unusable one affects no other topic."""
 
     def __init__(self) -> None:
         self._stores: dict[Topic, Any] = {}
@@ -112,8 +112,8 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    Two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Raises UndecodableMessageError if too
-    short.
+    The stamp's two 32-bit words follow four bytes (CDR's encapsulation, or ROS 1's `seq`). Raises
+    UndecodableMessageError if too short.
     """
     if message.topic.schema == TEXT:
         return message.log_time_ns
@@ -128,7 +128,7 @@ def header_stamp_ns(message: RawMessage) -> int:
 
 
 def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
-    """Pack a video image (H, W, 3) RGB, its stamp at CDR's place."""
+    """Pack an RGB video image (H, W, 3), with its stamp where CDR has it."""
     frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
     head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
     return bytes(head + frame + pixels.tobytes())
@@ -209,14 +209,14 @@ _DEPTH_UNITS = re.compile(r"(/device_\d+/sensor_\d+)/option/Depth[ _]Units/value
 
 @dataclass(kw_only=True)
 class RealSense:
-    """Extrinsics by stream and group, depth units by sensor, image units in order."""
+    """Extrinsics by stream and group, depth units [m] by sensor, image units [m] by stream."""
 
     extrinsics: dict[str, dict[str, Float64]] = field(default_factory=dict)
     depth_units: dict[str, float] = field(default_factory=dict)
     image_units: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take a Transform or option; ignore others. Raises ValueError if invalid."""
+        """Store extrinsics or a depth unit; ignore other topics. Raises ValueError if invalid."""
         extrinsics, units = _EXTRINSICS.fullmatch(topic), _DEPTH_UNITS.fullmatch(topic)
         if extrinsics:
             t, r = message.translation, message.rotation
@@ -234,7 +234,7 @@ class RealSense:
             self._say(topic, message.data)
 
     def add_image(self, message: RawMessage) -> None:
-        """Take an image's depth unit, if any. Raises ValueError if invalid."""
+        """Store an image's depth unit, if any. Raises ValueError if invalid."""
         if has_unit(message) and (value := struct.unpack("<f", message.data[-4:])[0]):
             self._say(message.topic.name, value)
 
@@ -272,7 +272,7 @@ def device_of(topic: str) -> str:
 
 
 def _unit(value: float, topic: str) -> float:
-    """Metres per count; 0.001 was written as a float32."""
+    """Metres per count, to six digits (0.001 was a float32)."""
     unit = float(f"{float(value):.6g}")
     refuse_if(not 0 < unit < 1, f"{topic}: expected metres per count, got {unit}", error=ValueError)
     return unit

@@ -72,7 +72,7 @@ _LAYOUT = {  # channels and dtype by encoding
 }
 NO_RETURN = 65535  # counts by which a camera of 16 bits says that it measured nothing
 NO_RETURN_M = np.float32(65.535)  # the same as metres
-FARTHEST = np.float32(1e5)  # units of a float depth, be they metres or millimetres, from which on none is measured
+FARTHEST = np.float32(1e5)  # units, metres or millimetres: a float depth of this or more is no return
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
 _FILES = (JPEG, PNG, b"RIFF", b"II*\0", b"MM\0*", b"BM")  # how files begin that should decode
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
@@ -81,10 +81,10 @@ _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMessage:
-    """An image as recorded, decoded only for its pixels.
+    """An image as recorded; `pixels` decodes it at first use.
 
-    width, height [px]. decode: pixels (H, W[, channels]) in `encoding`, or UndecodableMessageError. compressed: JPEG
-    or PNG bytes of `pixels`, if any. remark: a deviation from the format.
+    width, height [px]. decode: returns pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError.
+    compressed: JPEG or PNG bytes of `pixels`, if any. remark: a deviation from the format.
     """
 
     stamp_ns: int
@@ -213,7 +213,7 @@ def _is_rvl(file: bytes) -> bool:
 
 
 def _plain(packed: _Packed) -> tuple[str, tuple[int, int], bool] | None:
-    """Encoding, (height, width) and is_color; None if it must be decoded."""
+    """Encoding, (height, width) and is_color; None if only decoding shows them."""
     is_depth = packed.is_depth
     if is_depth and (packed.is_rvl or packed.recorded == "32FC1"):
         return None
@@ -235,7 +235,7 @@ def _decode(packed: _Packed, *, color: bool) -> NDArray[Any]:
 def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
     """Convert `raw_pixels` to colour (H, W, 3) uint8; Bayer mosaics are interpolated linearly.
 
-    Of 16 bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp).
+    In 16-bit channels, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp).
     """
     code = COLOR_CONVERSIONS[encoding]
     converted = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
@@ -245,9 +245,9 @@ def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
 
 
 def raw_pixels(message: Any) -> NDArray[Any]:
-    """Pixels (H, W[, channels]) of a sensor_msgs/Image; no channel for an unknown encoding.
+    """Pixels (H, W[, channels]) of a sensor_msgs/Image; zero channels for an unknown encoding.
 
-    Skips padding; reads either byte order. Raises UndecodableMessageError for too few data.
+    Skips row padding; reads either byte order. Raises UndecodableMessageError for too few data or a wrong size.
     """
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
@@ -302,7 +302,7 @@ def color_of(image: ImageMessage) -> UInt8:
 
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
-    """Depth (H, W) float32 [m] in the `unit` of `scale`; 0 = no return."""
+    """Depth (H, W) float32 [m], 0 = no return; `scale` as for `ImageMessage.unit`."""
     return (metres if image.is_counts else convert_floats)(image.pixels, image.unit(scale))
 
 
@@ -317,7 +317,7 @@ def num_invalid(depth: NDArray[Any]) -> int:
 def convert_floats(depth: NDArray[Any], scale: float) -> Float32:
     """Convert float depth (H, W) to float32 [m]; 0 = no return.
 
-    No return: 0, negative, non-finite (REP 118), 65535, 65.535 (its metres), and from `FARTHEST` on.
+    No return: 0, negative or non-finite (REP 118), 65535, 65.535 (65535 mm), or from `FARTHEST` on.
     """
     is_code = (depth == NO_RETURN) | (np.abs(depth - NO_RETURN_M) < 1e-4)
     return np.where((depth > 0) & (depth < FARTHEST) & ~is_code, depth * np.float32(scale), 0).astype(np.float32)
@@ -355,7 +355,8 @@ def _compressed_pixels(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None
 def _compressed_depth(packed: _Packed) -> tuple[NDArray[Any], str, bytes | None]:
     """Decode compressed_depth_image_transport (its codec.cpp and rvl_codec.cpp).
 
-    12 bytes (int32, two float32 A, B), then a PNG, or the sizes (two int32) and RVL; 32FC1 is A / (count - B).
+    After 12 bytes (int32, float32 A and B) comes a PNG, or width and height (int32) and RVL. 32FC1 depth is A /
+    (count - B).
     """
     counts = _rvl_counts(packed.file) if packed.is_rvl else decode_file(packed.file, color=False)
     if counts is None or counts.ndim != 2:
@@ -384,9 +385,9 @@ def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
 def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
     """Decode an RVL stream of little-endian words to pixels (num_pixels,).
 
-    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017. Runs of zeros and of values alternate; a value is
-    the zigzag-coded difference to the last nonzero one. Numbers are three-bit groups, low first, in nibbles whose
-    high bit marks a continuation; nibbles fill 32-bit words from the top. Raises ValueError if invalid.
+    A. D. Wilson, ISS 2017 (RVL). Runs of zeros and of values alternate. A value is the zigzag-coded difference from
+    the last nonzero pixel. Numbers are stored in nibbles: three bits each, lowest first, and a high bit if another
+    follows. Nibbles fill 32-bit words from the top. Raises ValueError if invalid.
     """
     numbers = _numbers(data)
     runs: list[tuple[int, int, int]] = []  # first pixel, first number, length
@@ -452,9 +453,9 @@ _CAMERAS = frozenset({"camera", "cam"})  # words of parts that name a device, wh
 
 
 def word_of(parts: tuple[str, ...], *, is_device: bool = True) -> str:
-    """The kind word in a topic's last part that has one; "" if none.
+    """Image kind, such as "depth" or "infra", that a topic names; "" if none.
 
-    In ``a_to_b`` the first counts. is_device: parts such as ``depth_camera`` count too.
+    The last part with a kind counts; of ``a_to_b``, only ``a``. is_device: parts such as ``depth_camera`` count too.
     """
     for part in reversed(parts):
         words = re.findall("[a-z]+", part.lower())

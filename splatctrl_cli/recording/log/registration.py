@@ -41,7 +41,7 @@ class _Edge:
     def __init__(self, parent: str, transforms: RowFile) -> None:
         self.parent = parent
         self.stamps, self.numbers = array("q"), array("q")
-        self.static: dict[int, Float64] = {}  # by the stamp [ns] from which on each holds, ascending
+        self.static: dict[int, Float64] = {}  # by the stamp [ns] from which on each is valid, ascending
         self.holds = False
         self._transforms = transforms
         self._is_sorted = True
@@ -111,11 +111,11 @@ class TfTree:
         static: bool,
         holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a stamp; one that `holds` is always valid while alone.
+        """Add T_parent_child at a stamp.
 
-        A frame keeps its first parent; edges that would close a loop are left out. Differing static transforms are
-        valid from their stamps on, the first also before. All is noted. Raises ValueError if not rigid (a zero
-        quaternion, NaN).
+        holds: valid at any time while its edge has no other. A frame keeps its first parent; edges that would close a
+        loop are left out. Differing static transforms are valid from their stamps on, the first also before. These
+        cases are noted. Raises ValueError if not rigid (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         refuse_if(
@@ -161,7 +161,7 @@ class TfTree:
         return self._ancestors(frame)[-1]
 
     def span_ns(self, frame: str) -> tuple[int, int] | None:
-        """First and last stamp with all moving edges above `frame` known; None if none moves."""
+        """Stamps [ns] between which all moving edges above `frame` are known; None if none moves."""
         moving = [edge.stamps for edge in [self._edges[f] for f in self._ancestors(frame)[:-1]] if not edge.static]
         return (max(min(s) for s in moving), min(max(s) for s in moving)) if moving else None
 
@@ -206,7 +206,7 @@ class TfTree:
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 _SEPARATORS = re.compile("[^a-z0-9]")
-_SAME_MODELS = {  # lower case, letters and digits alone: what others call them
+_SAME_MODELS = {  # other programs' names, in lower case, letters and digits only
     **dict.fromkeys(("plumbbob", "brownconrady", "radtan", "opencv"), "plumb_bob"),
     **dict.fromkeys(("rationalpolynomial", "rational"), "rational_polynomial"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye"), "equidistant"),
@@ -217,7 +217,7 @@ _PINHOLES = ("", "none", "pinhole", "perspective", "rectilinear", "inversebrownc
 
 
 def lens_model(name: str) -> str:
-    """One of `DISTORTION_MODELS` for a driver's name, else unchanged."""
+    """One of `DISTORTION_MODELS` for a driver's name; unknown names are unchanged."""
     return _SAME_MODELS.get(_SEPARATORS.sub("", name.lower()), name)
 
 
@@ -231,9 +231,9 @@ def is_distorted(model: str, coefficients: Float64) -> bool:
 class Lens:
     """Corrections of a camera's images.
 
-    intrinsics: of the result. maps (H, W): column and row in the recorded image by pixel, None if images stay as
-    recorded. valid (H, W): False where the lens saw nothing, None if it saw all; there colour is black, depth and
-    labels 0. depth_lens, T_color_depth (4, 4): of depth's own camera, None for depth on colour's pixels.
+    intrinsics: of the corrected image. maps (H, W): column and row in the recorded image by pixel, None if images
+    stay as recorded. valid (H, W): False where the lens saw nothing (colour is black, depth and labels 0), None if it
+    saw all. depth_lens, T_color_depth (4, 4): of depth's own camera, None for depth on colour's pixels.
     """
 
     intrinsics: Intrinsics
@@ -258,9 +258,10 @@ class Lens:
 
 
 def warp_depth(depth: Float32, own: Intrinsics, target: Intrinsics, T_color_depth: Float64) -> Float32:
-    """Warp depth (H', W') [m] of camera `own` into the colour camera `target`, (H, W) [m], 0 = none.
+    """Warp depth (H', W') [m] of camera `own` to colour camera `target`, (H, W) [m], 0 = none.
 
-    Each depth pixel fills the image of its square, so that finer colour pixels get no holes; the nearest wins.
+    Each depth pixel fills its square as `target` sees it, so that finer colour pixels get no holes; the nearest depth
+    counts.
     """
     x, y, z = transform_points(T_color_depth, back_project(own, depth)[depth > 0]).T
     front = z > 0
@@ -291,7 +292,7 @@ def undistort_lens(
 ) -> Lens:
     """A lens without its distortion, shown with intrinsics `result`. Raises InputError for an impossible lens.
 
-    recorded: of the distorted image, by default the result's. R (3, 3): the lens's axes to the result's.
+    recorded: intrinsics of the distorted image, by default `result`. R (3, 3): the lens's axes to the result's.
     """
     R = np.eye(3) if R is None else R
     counts = (4,) if model == "equidistant" else NUM_COEFFICIENTS
@@ -344,9 +345,10 @@ def _bent(model: str, coefficients: Float64) -> tuple[Float64, Float64]:
 
 
 def correct_lens(lens: Intrinsics, model: str, coefficients: Float64, valid: Bool | None = None) -> Lens:
-    """A lens's corrections: none for a pinhole, whose mask is `valid`.
+    """A lens's corrections; a pinhole has none but the mask `valid`.
 
-    Raises InputError for an impossible lens. Focal lengths stay; an equidistant lens's shrink, up to `WIDEST_RAY`.
+    Focal lengths stay; an equidistant lens's shrink to show its whole image, up to `WIDEST_RAY`. Raises InputError
+    for an impossible lens.
     """
     if not is_distorted(model, coefficients):
         return Lens(intrinsics=lens, valid=valid)

@@ -46,7 +46,8 @@ _RECTIFIED = frozenset({"rect", "rectified", "undistorted"})  # words in the nam
 class Camera(Lens):
     """An RGB-D camera of a log.
 
-    fixed_pose: the user's T_world_camera. human_topic: its masks. depth_scale [m per count]: the user's or the log's.
+    fixed_pose: the user's T_world_camera. human_topic: of its masks. depth_scale [m per count]: the user's or the
+    log's.
     """
 
     name: str
@@ -94,7 +95,7 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The options' cameras, else those found; a mask is never colour."""
+    """The options' cameras, else those found; a mask topic is never colour."""
     return _given_topics(log, survey, options) or find_cameras(survey, without=options.human_topics.values())
 
 
@@ -155,7 +156,7 @@ def _rectify(calibration: Calibration) -> Calibration:
     if not is_distorted(model, calibration.distortion) or model not in DISTORTION_MODELS:
         return pinhole
     lens, R = intrinsics_of(calibration), calibration.rotation if np.any(calibration.rotation) else None
-    with suppress(InputError):  # of a lens that cannot be, nothing says what it saw
+    with suppress(InputError):  # an impossible lens does not say what it saw
         seen = undistort_lens(intrinsics_of(pinhole), model, calibration.distortion, recorded=lens, R=R)
         return replace(pinhole, valid=seen.valid)
     return pinhole
@@ -165,10 +166,10 @@ ImageLens = Literal["pinhole", "distorted", "rectified", "contradicted"]  # by C
 
 
 def image_lens(survey: Survey, image_topic: str, calibration: Calibration) -> ImageLens:
-    """Decide if images are rectified, by topic name and CameraInfo.
+    """Classify the lens of images by topic name and CameraInfo.
 
-    A distorted CameraInfo may describe rectified images next to raw ones (image_proc): by a P unlike K, or raw images
-    in the folder. RealSense's ``image_rect_raw`` is distorted.
+    A topic named rectified may have the distorted CameraInfo of raw images (image_proc). Its images are rectified if
+    P differs from K, raw images are in its folder, or they are depth. RealSense's ``image_rect_raw`` is distorted.
     """
     says_rectified = not _RECTIFIED.isdisjoint(re.split("[/_]", image_topic.lower()))
     if not is_distorted(calibration.distortion_model, calibration.distortion):
@@ -365,7 +366,7 @@ class _Builder:
         calibration = self._calibration(topics.depth_info, topics.depth)
         frame = depth_image.frame_id
         T_color_depth = self._survey.realsense.T_between(topics.color, topics.depth)
-        if is_registered(self._survey, topics.color, topics.depth, topics.info, ""):  # but for the lens
+        if is_registered(self._survey, topics.color, topics.depth, topics.info, ""):  # except for the lens
             T_color_depth = np.eye(4)
             self._survey.tf.note(
                 f"camera {topics.name}: {topics.info} and {topics.depth_info} differ in distortion: colour and depth"

@@ -1,6 +1,6 @@
 """A ROS log as records: paired images, poses from tf, joints in one order.
 
-The first pass skips images, as transforms may follow them, and plans every frame. The second takes planned images in
+The first pass skips images, as transforms may follow them, and plans every frame. The second reads planned images in
 plan order. For `ingest`, files that a capture can keep stay undecoded.
 """
 
@@ -89,7 +89,7 @@ class FramePlan:
         masks: Mapping[int, int],
         poses: Iterable[Float64 | None],
     ) -> int:
-        """Add frames (K,) with known poses (4, 4), masks by colour number; return their number."""
+        """Add the frames with a pose (4, 4), masks by colour number; return their number."""
         first = len(self._poses)
         is_known = np.fromiter(map(self._keep, poses), np.bool_, len(stamp_ns))
         human = np.array([masks.get(index, NO_MASK) for index in color[is_known].tolist()], dtype=np.int64)
@@ -127,12 +127,12 @@ class FramePlan:
         }
 
 
-HELD_BYTES = 96 << 20  # of images that wait for others, in memory; more of them wait in a file without a name
+HELD_BYTES = 96 << 20  # of waiting images in memory; more of them wait in a file without a name
 Key = tuple[str, int]  # topic, number of the message within it
 
 
 class HeldMessages:
-    """Waiting messages, which can be half of a log that stores topics apart."""
+    """Messages waiting for their frame: up to half of a log that stores topics apart."""
 
     def __init__(self) -> None:
         self._messages: dict[Key, RawMessage] = {}
@@ -175,7 +175,7 @@ def planned_images(
 ) -> Iterator[tuple[PlannedFrame, list[RawMessage]]]:
     """Yield frames in plan order with colour, depth and mask messages.
 
-    `waiting` keeps others; missing frames go to `damage`.
+    `waiting` stores messages of later frames; frames that stay incomplete are `damage`.
     """
     uses, position, num = plan.uses(), 0, len(plan)
     numbers, planned = dict.fromkeys(uses, 0), plan[0]
@@ -355,7 +355,7 @@ class RosLogSource(FrameSource):
 def _images(
     decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
 ) -> list[ImageMessage]:
-    """Colour, depth and mask; is_whole: all decoded, for no capture.
+    """Colour, depth and mask; is_whole: decode even what a capture can keep.
 
     Raises UndecodableMessageError.
     """

@@ -20,7 +20,7 @@ class StateColumns(Sequence[JointState]):
     """T states by stamp: stamp_ns (T,); position, velocity (T, J).
 
     commanded_velocity (T, J), T_base_ee, T_world_ee (T, 4, 4): None if absent, NaN where a state has none. Indexing
-    and iteration give states, read a block at a time.
+    and iteration return states, reading a block at a time.
     """
 
     stamp_ns: Stamps
@@ -50,7 +50,10 @@ class StateColumns(Sequence[JointState]):
             yield from self.states(first, last)
 
     def postures(self, within_ns: int) -> Posture:
-        """Positions at any time, linear between states at most `within_ns` away; None without any."""
+        """Function from stamp [ns] to positions (J,), None without a state within `within_ns`.
+
+        Linear between two such states.
+        """
 
         def posture(stamp_ns: int) -> Float64 | None:
             after = int(np.searchsorted(self.stamp_ns, stamp_ns))
@@ -123,7 +126,7 @@ class ColumnWriter:
     """A writer of columns by state, in blocks; NaN if missing."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]], blocks: Mapping[str, Iterable[Float64]]) -> None:
-        """shapes: a row's; blocks: columns of known states. Raises ValueError if they differ in length."""
+        """shapes: of one row; blocks: known states' columns. Raises ValueError if these differ in length."""
         self._shapes = shapes
         self._files = {name: RowFile(shapes[name], of_column) for name, of_column in blocks.items()}
         self._num, *others = {len(file) for file in self._files.values()} or {0}  # states that are in the files
@@ -139,7 +142,7 @@ class ColumnWriter:
             self._flush()
 
     def columns(self) -> dict[str, Rows]:
-        """Columns (T, ...) so far, but those without any value; NaN where a state has none."""
+        """Columns (T, ...) with any value so far; NaN where a state has none."""
         self._flush()
         return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
 
@@ -150,7 +153,7 @@ class ColumnWriter:
             if name not in self._files and any(value is not None for value in values):
                 self._files[name] = RowFile(
                     shape, ((np.full((last - first, *shape), np.nan) for first, last in ranges(self._num)))
-                )  # one that comes up late
+                )  # a column whose first value comes late
             if name in self._files:
                 self._files[name].append(np.array([nothing if value is None else value for value in values]))
         self._num += len(states)

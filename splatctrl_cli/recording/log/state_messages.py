@@ -30,8 +30,8 @@ _NONE: Float64 = np.zeros(0)
 class RawJoints:
     """A joint state as recorded, in the order of its names.
 
-    position (J,); velocity, commanded_velocity (J,) or empty; T_base_ee (4, 4): the controller's end effector; note:
-    what is unused, and why.
+    position (J,); velocity, commanded_velocity (J,) or empty. T_base_ee (4, 4): the controller's end-effector pose.
+    note: what is not used, and why.
     """
 
     stamp_ns: int
@@ -49,7 +49,7 @@ _Read = tuple[str, Any, Any, Any, Any, Float64 | None]
 
 
 def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
-    """States of a `STATE_TYPES` message, log time [ns]. Raises UndecodableMessageError."""
+    """Joint states of a `STATE_TYPES` message; log time [ns]. Raises UndecodableMessageError."""
     if type_name == TRAJECTORY:
         return _trajectory(message, log_time_ns)
     read = _franka if type_name in FRANKA_STATES else _controller if type_name == CONTROLLER_STATE else _joint_state
@@ -81,7 +81,7 @@ def _joint_state(message: Any) -> _Read:
 
 
 def rigid_or_none(T: Float64) -> Float64 | None:
-    """The pose (4, 4); None unless finite and a rotation (an unfilled field is zeros)."""
+    """The pose T (4, 4), None unless it is rigid; an unfilled field is zeros."""
     R = T[:3, :3]
     is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
     return T if is_rigid else None
@@ -202,7 +202,10 @@ class JointStream(ColumnWriter):
 
 
 class JointLog:
-    """`num` states; streams by their joints; first_names: the first state's, or None; notes: counted."""
+    """`num` joint states of a topic, in streams by their joints.
+
+    first_names: the first state's joints, or None. notes: counts by text.
+    """
 
     def __init__(self, streams: Sequence[JointStream] = (), num: int = 0) -> None:
         self.first_names = streams[0].names if streams else None

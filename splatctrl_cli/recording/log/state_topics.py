@@ -30,7 +30,7 @@ from splatctrl_cli.recording.log.survey import Survey, TopicSurvey
 from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, Float64, Index, LossReport, Stamps
 
-_COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")  # in topics of what is wished
+_COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")  # in names of command topics
 
 
 def joint_records(
@@ -38,8 +38,8 @@ def joint_records(
 ) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; both empty if the log has none.
 
-    With `joints` (a robot's), their topics are merged. Else one topic is used; states of other joints than its
-    fullest are left out with a note.
+    With `joints` (a robot's), their topics are merged. Else one topic is used: its states with the most joints; the
+    others are left out with a note.
     """
     topics = state_topics(survey, options, loss)
     if not topics:
@@ -78,7 +78,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
 
 def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
-    """/joint_states, else the JointState topic with most messages, else another type's; commands last."""
+    """Prefer /joint_states, then the JointState topic with most messages, then others; commands come last."""
     chosen = max(
         topics,
         key=lambda t: (
@@ -107,8 +107,9 @@ def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
 def track_of_joints(topics: Sequence[TopicSurvey], joints: Sequence[str], loss: LossReport) -> RawTrack:
     """Merge the states of `joints` from as few topics as possible.
 
-    The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Other joints are
-    interpolated. States outside their times, or in gaps over `STATES_BRIDGED` with motion, are left out with a note.
+    The topic with most of them gives the stamps; ties prefer end-effector poses, then /joint_states. Joints of other
+    topics are interpolated. States outside those topics' times, or in their gaps over `STATES_BRIDGED` with motion,
+    are left out with a note.
     """
     tracks = _rename_joints(_tracks(topics), joints, loss)
     base = _base(tracks, joints)
@@ -164,8 +165,8 @@ def _is_command(topic: str) -> bool:
 def refuse_contradiction(topics: Sequence[TopicSurvey], joints: Sequence[str] | None) -> None:
     """Raise if the states of `joints` (None: all) come from two robots.
 
-    InputError if another topic, not of commands, has them over `STATES_RIVAL` apart; NotEvaluableError if two
-    publishers take turns on one topic.
+    InputError if another topic, not of commands, has the joints over `STATES_RIVAL` away (median); NotEvaluableError
+    if two publishers take turns on one topic.
     """
     tracks = _tracks(topics)
     if joints is None:
@@ -235,7 +236,7 @@ def _rename_joints(tracks: list[RawTrack], joints: Sequence[str], loss: LossRepo
 
 
 def match_prefix(logged: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
-    """Map a log's joint names to the robot's by the best prefix, else empty."""
+    """Map a log's joint names to a robot's by the commonest prefix; empty if unclear."""
     by_prefix: dict[tuple[str, bool], dict[str, str]] = {}
     for name in dict.fromkeys(logged):
         for joint in joints:
@@ -300,9 +301,9 @@ def _is_still(table: Table, before: Index, after: Index) -> Bool:
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
-    """Stamps (T,) [ns] in file order, of headers, or the log's if none has one.
+    """Header stamps (T,) [ns] in file order, or log times if no header has one.
 
-    Notes another clock, drift and steps in `loss`. Raises InputError for two clocks.
+    Notes another clock, drift and steps in `loss`. Raises InputError if two clocks are mixed.
     """
     is_unset = stamp_ns == 0
     if is_unset.all():
@@ -358,7 +359,7 @@ def _refuse_mixed(step: float, state: int, where: str) -> None:
 def _drift(late: Float64, seconds: Float64) -> tuple[float, float]:
     """Growth [s] of the log delay from first to last quarter, and the seconds between.
 
-    By each quarter's tenth percentile, as a message may be logged late; 0 if it is a step or a stall.
+    Compares the quarters' tenth percentiles, as a message may be logged late. The growth is 0 if the delay jumps.
     """
     quarter = len(late) // 4
     span = float(np.median(seconds[-quarter:]) - np.median(seconds[:quarter])) if quarter >= 10 else 0.0

@@ -30,8 +30,8 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
 def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     """Times (T,) [s] since the first stamp, without the sender's jitter.
 
-    A line is fitted through neighbouring stamps over their numbers, lost ones counted. Stamps without a fixed rate
-    (residuals above a quarter period) are unchanged.
+    Fits a line to neighbouring stamps against message numbers, in which lost messages count. Stamps without a fixed
+    rate (RMS residual above a quarter period) are returned unchanged.
     """
     seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
     if len(seconds) < 3:
@@ -76,14 +76,14 @@ def _numbers(seconds: Float64, period: float) -> Float64:
 def differentiate(stamp_ns: Stamps, position: Float64) -> Float64:
     """Velocities (T, J) [1/s] of positions (T, J) at rising stamps (T,) [ns].
 
-    The slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven steps), on
-    the smoothed clock, never across a gap. A lone state has 0.
+    Each is the slope of a parabola through the state and two neighbours on either side (Savitzky-Golay for uneven
+    steps). Times are `smoothed_seconds`; no parabola crosses a gap. A lone state has 0.
     """
     return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
 
 
 def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
-    """Yield `differentiate` by block: first state, velocities (K, J)."""
+    """Yield `differentiate` by block: index of the first state, velocities (K, J)."""
     for start, end in pairwise([0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]):
         if end - start == 1:
             yield start, np.zeros((1, *position.shape[1:]))
@@ -112,7 +112,7 @@ def _slopes(seconds: Float64, position: Float64) -> Float64:
 class RawTrack(StateColumns):
     """States as recorded, in file order; absent velocity is NaN.
 
-    where: its name in messages. log_ns (T,): log times [ns].
+    where: the track's name in messages. log_ns (T,): log times [ns].
     """
 
     where: str
@@ -125,10 +125,10 @@ class RawTrack(StateColumns):
 
 
 def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
-    """Sort states by stamp, each stamp once, each with velocities; changes are noted in `loss`.
+    """Sort states by stamp, drop repeated stamps, add missing velocities; note changes in `loss`.
 
-    States with a position that is not finite are damage, and left out. Absent or NaN velocities, and zeros of a
-    moving joint, become position differences.
+    States with a non-finite position are damage, and left out. Velocities that are absent, NaN, or always zero for a
+    moving joint become slopes of the positions.
     """
     ordered = unwrap(_sort(_finite(raw, loss), loss), loss)
     gaps = gaps_of(ordered.stamp_ns)
@@ -147,7 +147,7 @@ def clean_states(raw: RawTrack, loss: LossReport) -> StateColumns:
 
 
 def unwrap(raw: RawTrack, loss: LossReport) -> RawTrack:
-    """Remove whole turns between states in time order, such as pi to -pi."""
+    """Remove jumps of a whole turn between successive states, such as pi to -pi."""
     position, file = raw.position, RowFile(raw.position.shape[1:])
     turns: Float64 = np.zeros(position.shape[1])
     is_close = np.diff(raw.stamp_ns) * 1e-9 <= fixed.STATES_BRIDGED
@@ -220,7 +220,7 @@ def _add_velocity(raw: RawTrack, loss: LossReport) -> Table:
 
 
 def _missing_velocities(raw: RawTrack) -> tuple[int, Bool, str]:
-    """Number of states to differentiate, moving joints (J,) of velocity 0, a note."""
+    """Number of states to differentiate, mask (J,) of moving joints with zero velocity, a note."""
     num, num_joints = raw.position.shape[:2]
     low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
     is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))

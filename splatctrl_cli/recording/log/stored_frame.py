@@ -1,7 +1,7 @@
 """Frames and joint states as their source stored them, which `ingest` keeps without decoding.
 
-joint_topics/K/: stamp_ns.npy, log_time_ns.npy (T,) int64; position.npy and, if any, velocity.npy,
-commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; capture.json describes each K.
+joint_topics/K/ has stamp_ns.npy, log_time_ns.npy (T,) int64, and float64 columns: position.npy and, if any,
+velocity.npy, commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4). capture.json describes each K.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -64,7 +64,7 @@ def merge_joints(loss: LossReport, joints: LossReport, at: int, *, sign: int = 1
 
 
 def write_topics(folder: Path, joints: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
-    """Write streams into a capture; `wrote` gets each file. Returns the capture.json entry."""
+    """Write streams into a capture, calling `wrote` with each file. Returns the capture.json entry."""
     described, number = [], 0
     for topic in joints.topics:
         streams = []
@@ -176,9 +176,10 @@ def _blocks(path: Path) -> Iterator[Float64]:
 class StoredFrame:
     """A frame whose images decode on demand, with their files as the source stored them.
 
-    read_color, read_depth: the image, or UndecodableMessageError. color_file: JPEG or PNG bytes of exactly the color.
-    depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit: [m] of which every
-    depth is a uint16 multiple. Each may be None. origin: the source in words. places: of the messages.
+    read_color, read_depth: return the image, or raise UndecodableMessageError. color_file: JPEG or PNG bytes of
+    exactly the color. depth_file: 16-bit PNG whose ``counts * float32(depth_unit)`` is exactly the depth. depth_unit
+    [m]: every depth is a uint16 multiple of it. These three may be None. origin: the source in words. places: the
+    messages, without data.
     """
 
     stamp_ns: int
@@ -197,17 +198,17 @@ class StoredFrame:
 
     @cached_property
     def color(self) -> UInt8:
-        """The colour. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_color)
 
     @cached_property
     def depth(self) -> Float32:
-        """The depth. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return self._read(self.read_depth)
 
     @property
     def frame(self) -> RgbdFrame:
-        """The decoded frame. Raises InputError if undecodable."""
+        """Raises InputError if undecodable."""
         return RgbdFrame(
             stamp_ns=self.stamp_ns,
             camera=self.camera,
@@ -225,11 +226,11 @@ class StoredFrame:
 
 
 class FrameSource:
-    """A `RecordSource` by stamp: joint states, and `_frames`, which are read as stored.
+    """A `RecordSource` in stamp order: joint states, and frames as stored.
 
-    world_frame: the source's frame of poses. states: by stamp, without reading frames. joint_topics: those that a log
-    has, None if unknown. depth_fault: why no frame has depth, None where some may; only image folders have one.
-    tf_frames: T_world_frame (4, 4) [m] by frame, None if tf moves it.
+    world_frame: of the source's poses. states: by stamp, known without reading frames. joint_topics: a log's, None if
+    unknown. depth_fault: why no frame has depth (image folders only), None if some may. tf_frames:
+    T_world_frame (4, 4) [m] by tf frame, None if tf moves it.
     """
 
     name: str
@@ -263,7 +264,7 @@ class FrameSource:
         return merge_by_stamp(self.states, self._frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
-        """Yield stamp [ns], camera, T_world_camera (4, 4) by stamp, without images."""
+        """Yield (stamp [ns], camera, T_world_camera (4, 4)) in stamp order, without images."""
         return iter(())
 
     def _frames(self) -> Iterator[StoredFrame]:
@@ -271,7 +272,7 @@ class FrameSource:
 
 
 def is_kept(data: bytes | None, *kinds: bytes) -> bool:
-    """True for a JPEG or PNG, which captures keep, or for one of `kinds`."""
+    """True if `data` begins as one of `kinds`, by default JPEG or PNG."""
     return data is not None and data.startswith(kinds or (JPEG, PNG))
 
 
@@ -280,7 +281,10 @@ def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
 
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
-    """(H, W) uint8, 1 where not 0. Raises InputError unless 8-bit grey of that size."""
+    """Mask (H, W) uint8, 1 where `pixels` are not 0.
+
+    Raises InputError unless 8-bit grey of the camera's size.
+    """
     size = "x".join(map(str, reversed(pixels.shape[:2])))
     channels = pixels.shape[2] if pixels.ndim == 3 else 1
     refuse_if(
@@ -295,7 +299,7 @@ def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
 def check_depth(depth: Float32, where: str, scale: float) -> bool:
     """True if a depth image [m] has any depth. Raises InputError for an implausible median.
 
-    scale: metres per count it was read with.
+    scale: metres per count by which `depth` was read.
     """
     valid = depth[depth > 0]
     if valid.size == 0:

@@ -66,7 +66,8 @@ def pair_images(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArra
 class StampClock:
     """A detector of header clocks that go back; single stamps may err.
 
-    num_back: stamps over a second behind an earlier one; back_ns: the first one's distance, at log time back_log_ns.
+    num_back: stamps over `IMAGES_BACK_NS` behind an earlier one. back_ns: how far behind the first was, at log time
+    back_log_ns.
     """
 
     num_back: int = 0
@@ -92,7 +93,7 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 def dropped(stamps_ns: Stamps) -> tuple[int, int, float]:
     """Number of gaps, images missing in them, and the period [ns].
 
-    The period is the median interval; three of four must be within a quarter of it.
+    The period is the median interval. Gaps count if three of four intervals are within a quarter of the period.
     """
     intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
     if len(intervals) < IMAGES_FEWEST:
@@ -111,10 +112,10 @@ _MOST_BYTES = 64 << 20  # of chunks that are unpacked
 class Calibration:
     """A CameraInfo's contents.
 
-    size [px]; K (3, 3) of the raw image with its distortion; projection (3, 3) of the rectified image (left part of
-    P); rotation (3, 3) from the raw axes to the rectified; both zero if unset. valid (H, W): False where the lens did
-    not see a rectified pixel. They fit binned or cropped images, sensor_K (3, 3) the whole sensor; cut says how,
-    is_possible if the region is inside.
+    width, height [px]. K (3, 3): of the raw, distorted image. projection (3, 3): of the rectified image (left part of
+    P). rotation (3, 3): from the raw axes to the rectified. projection and rotation are zero if unset. valid (H, W):
+    False where the lens did not see a rectified pixel. Size, K and projection fit binned or cropped images, sensor_K
+    (3, 3) the whole sensor. cut: binning and region in words. is_possible: the region is inside.
     """
 
     width: int
@@ -133,7 +134,7 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """A topic; stamps_ns and clock (images only) are headers', or log times."""
+    """A topic; stamps_ns and clock (images only) are header stamps or log times."""
 
     topic: Topic
     count: int = 0
@@ -345,7 +346,7 @@ _TEXT = 4  # a parameter's type that is text (rcl_interfaces/ParameterType)
 
 
 def robot_descriptions(log: RawLog) -> list[tuple[str, str]]:
-    """Topic or node and text of a log's URDFs, each once, from first messages."""
+    """Pairs (topic or node, text) of a log's URDFs, each once, from first messages."""
     topics = log.topics()
     own = {t.name for t in topics if t.type_name == STRING and t.name.rpartition("/")[2] == NAME}
     of_events = {t.name for t in topics if t.type_name == EVENT} if topics else {f"/{NAME}", EVENTS}  # no index

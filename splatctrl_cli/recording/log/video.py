@@ -23,7 +23,7 @@ from splatctrl_cli.recording.log.decoder import IMAGE, VIDEO, MessageDecoder, Un
 from splatctrl_cli.records import SECOND_NS, Stamps
 
 LIBRARY, EXTRA = "av", "video"
-CODECS = {"264": "h264", "265": "hevc", "hevc": "hevc"}  # by what a format's name holds
+CODECS = {"264": "h264", "265": "hevc", "hevc": "hevc"}  # by a part of the format's name
 FORMATS = {  # the field that names the format, by the type of message
     "foxglove_msgs/msg/CompressedVideo": "format",
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "encoding",
@@ -42,8 +42,8 @@ def is_video(topic: Topic) -> bool:
 class _Stream:
     """A topic's decoder.
 
-    num: packets. waiting: (message without data, header) by packet. key: last key frame. broken: packets since then
-    with losses. num_early, num_late: images lost before the first key frame, and after.
+    num: packets. waiting: (message without data, header) by packet. key: the last key frame. broken: packets since
+    then with losses. num_early, num_late: images lost before the first key frame, and after it.
     """
 
     context: Any
@@ -111,7 +111,7 @@ def _decoded_topic(topic: Topic) -> Topic:
 
 
 def _images(stream: _Stream, data: bytes | None, number: int = 0) -> Iterator[RawMessage]:
-    """Yield whole images that a packet releases; without data, the rest."""
+    """Yield undamaged images that a packet completes; without data, the remaining ones."""
     frames, is_broken = _decode(stream.context, data, number)
     if is_broken:
         stream.broken.append(number)
@@ -181,8 +181,8 @@ def open_log(path: Path) -> RawLog:
 class VideoFileLog(RawLog):
     """The images of ``X.mp4`` as topic ``/X``, at the times in ``X.csv`` or its kin.
 
-    That file has a stamp per line, or a column named time or stamp. Before the point, 10 digits are seconds since
-    1970, 13 milliseconds, 16 microseconds, 19 nanoseconds; fewer than ten are seconds.
+    The stamp file has a stamp per line, or a column named time or stamp. Stamps with 10 digits before the point are
+    seconds since 1970, with 13 milliseconds, 16 microseconds, 19 nanoseconds; with fewer than ten, seconds.
     """
 
     container = "video"
@@ -200,7 +200,7 @@ class VideoFileLog(RawLog):
         self.channels = {0: Topic(name=f"/{path.stem}", type_name=IMAGE, encoding=VIDEO, schema=path.suffix)}
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the images. Raises InputError if they and the stamps differ in number."""
+        """Yield the images. Raises InputError if images and stamps differ in number."""
         if names is not None and self.channels[0].name not in names:
             return
         num, losses = 0, Damage()

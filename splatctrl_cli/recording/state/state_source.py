@@ -65,7 +65,7 @@ class StateSource(FrameSource):
 
 
 def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
-    """Open an input's states of `joints` (a robot's) and its frames, where it has them.
+    """Open an input's states of a robot's `joints`, and its frames, if any.
 
     Raises InputError if missing, or without usable states.
     """
@@ -141,7 +141,7 @@ _SEE = "see splatctrl help replay, Twists"
 class LoggedTwists:
     """N twists: stamp_ns (N,) rising, twist (N, 6) [m/s, rad/s], linear first.
 
-    frame: the log's name, or "". notes: dropped twists and the stamps' clock.
+    frame: as the log names it, or "". notes: dropped twists and the stamps' clock.
     """
 
     where: str
@@ -153,7 +153,7 @@ class LoggedTwists:
 
 @dataclass(frozen=True, kw_only=True)
 class TwistsTable:
-    """``[twists]``: a file and its columns, as ``[states]``; frame: world or a link."""
+    """Table ``[twists]``: a file and columns as in ``[states]``; frame: world or a link."""
 
     file: str
     time: str
@@ -167,8 +167,8 @@ class TwistsTable:
 def read_twists(path: Path, topic: str) -> LoggedTwists:
     """Read the twists of a log's topic, or of a TOML file's table (always ``twists``).
 
-    Stamps are headers', or log times if no header has one. Non-finite twists are dropped with a note; of equal stamps
-    the last is kept. Raises InputError without twists, or in several frames.
+    Stamps are those of headers, or log times if no header has one. Non-finite twists are dropped with a note; of
+    equal stamps, the last is kept. Raises InputError without twists, or for several frames.
     """
     if path.suffix == ".toml":
         return _read_described(path, topic)

@@ -1,8 +1,8 @@
 """Joint states in CSV, NPZ, HDF5, Parquet, by a TOML (docs/replay.md, Logs); libfranka's logs.
 
 LeRobot datasets are a preset of [states]. Versions 2 and 3 (huggingface/lerobot, lerobot_dataset.py, utils.py) list
-features in ``meta/info.json``. v2 has ``data/chunk-000/episode_000000.parquet`` per episode; v3 shares
-``data/chunk-000/file-000.parquet`` by column ``episode_index``. ``observation.state`` is position, ``timestamp``
+features in ``meta/info.json``. v2 has a ``data/chunk-000/episode_000000.parquet`` per episode, v3 a shared
+``data/chunk-000/file-000.parquet`` with column ``episode_index``. ``observation.state`` is position, ``timestamp``
 seconds from the episode's begin.
 """
 
@@ -41,7 +41,7 @@ class CsvTable:
     names: list[str]
 
     def index(self, name: str | int) -> int:
-        """The first column so named; a number is unchanged. Raises InputError."""
+        """Number of the first column so named; numbers are unchanged. Raises InputError."""
         if isinstance(name, int):
             return name
         refuse_if(
@@ -56,8 +56,8 @@ class CsvTable:
     ) -> tuple[Stamps, dict[str, Rows]]:
         """Read stamps (T,) [ns] and each group's numbers (T, K), NaN for an empty cell.
 
-        Times are in `unit_ns`, every digit kept; columns are names or numbers. Raises InputError naming line and
-        column, for a line of another length, and without states.
+        Times count `unit_ns`, every digit kept; columns are names or numbers. Raises InputError for a wrong cell
+        (naming line and column), a line of another length, and no states.
         """
         chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
         at, stamps = self.index(time), array("q")
@@ -123,8 +123,8 @@ def libfranka_track(table: CsvTable) -> RawTrack:
     """The states of a log by franka::logToCSV, joints named joint1 ... joint7.
 
     The first column counts milliseconds since power-on. Positions are ``q[0]`` to ``q[6]``, velocities ``dq[0]``...,
-    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second columns ``dq_d``
-    (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose by columns.
+    prefixed with ``state.`` since libfranka 0.14. Commands are ``cmd.dq_d``, earlier the second of two ``dq_d``
+    (libfranka, src/log.cpp, src/logging/robot_state_log.cpp). O_T_EE is the end effector's pose in column order.
     """
     refuse_if(
         table.names[0] not in {"time", "duration"} or _first(table, "q", 0) is None,
@@ -191,7 +191,7 @@ INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_
 
 
 def lerobot_preset(folder: Path, episode: int | None) -> Mapping[str, Any]:
-    """An episode's keys of [states], by default the only one. Raises InputError."""
+    """The [states] keys of an episode (None: the only one). Raises InputError."""
     info = read_json(folder / INFO)
     with refuse_faults(
         lambda error: f"{folder / INFO}: expected total_episodes and the feature {POSITION}, got no usable {error}",
@@ -247,7 +247,7 @@ class StatesTable:
     """``[states]``: a file and its columns; an array (T, K) gives K columns.
 
     epoch_ns: Unix time of time 0. pose: x, y, z, qx, qy, qz, qw, or a matrix's 16 numbers by pose_order. preset: one
-    of `PRESETS`, which fills missing keys for the dataset `file`; episode: of it.
+    of `PRESETS`, which fills missing keys for the dataset `file`. episode: that of the dataset.
     """
 
     file: str
@@ -267,7 +267,7 @@ class StatesTable:
 
 
 def read_described_track(path: Path) -> tuple[RawTrack, Path]:
-    """Read described states, and their file. Raises InputError naming key or column."""
+    """Read states by a TOML, and their file. Raises InputError naming key or column."""
     table = read_table(
         StatesTable, path, "states", others=("twists",), fill=lambda content: fill_preset(path, content)
     )
@@ -318,7 +318,7 @@ def fill_preset(path: Path, keys: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
-    """Columns that a table of TOML file `path` names. Raises InputError."""
+    """Columns of the file that a TOML's table names. Raises InputError."""
     file = path.parent / name
     refuse_if(
         not file.is_file(), f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml"
