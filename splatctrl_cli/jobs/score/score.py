@@ -1,4 +1,4 @@
-"""A score of scenes against held-out views of one or several scans."""
+"""Score of scenes against held-out views of one or several scans."""
 
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -42,11 +42,11 @@ from splatctrl_cli.report.pictures import comparison_picture, view_picture
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRequest:
-    """One scene, or a folder of scenes named like scans, to score on views.
+    """Scene, or a folder of scenes named like scans, to score on views.
 
-    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render from the
-    newest snapshot not later than a view, else the final splats. images: of ``all`` views, each camera's
-    ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
+    recording: the cameras in its options are scored. baseline: score.json of an earlier score. newest: render the
+    newest snapshot up to a view, else the final splats. images: ``all`` views, each camera's ``best-worst``, or
+    ``none``. Raises UsageError for ``all`` without `out`.
     """
 
     scene: Path
@@ -74,7 +74,7 @@ class ScoreRequest:
 def score(request: ScoreRequest, progress: Progress = SILENT) -> JudgedResult:
     """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError.
 
-    Document: the content of ``score.json``.
+    Document: ``score.json``.
     """
     if request.baseline is not None:
         read_baseline(request.baseline)  # refuses it before the views are scored
@@ -245,7 +245,7 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """Scenes by scan in a folder of them; empty for a single scene."""
+    """Scenes by scan in a folder of scenes; empty for a single scene."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
@@ -286,7 +286,7 @@ def _score_scans(
 def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     """Recording of one scan with its masks in DIR/SCAN.
 
-    Raises InputError without them: masks of one scan fit no other.
+    Raises InputError without that folder: masks of one scan fit no other.
     """
     masks = None if recording.masks is None else recording.masks / scan
     refuse_if(
