@@ -33,9 +33,9 @@ BASE = "the robot's base"
 class CalibrateRequest(SessionRequest, RobotOptions):
     """Calibration of a recording's cameras.
 
-    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera;
-    None: the first, without a robot or moving camera. board: for initial poses. allow_unobserved: write an incomplete
-    calibration.
+    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera. None
+    fixes the first if there is no robot or moving camera. board: for initial poses. allow_unobserved: write an
+    incomplete calibration.
     """
 
     out: Path | None = None

@@ -55,7 +55,7 @@ Perform = Callable[[Sequence[str], Path], str]
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRequest:
-    """Demo on `data`, a folder that `splatctrl simulate` wrote, into the folder `out`.
+    """Demo on `data`, a folder of `splatctrl simulate`, into the folder `out`.
 
     data: None for the sample recording, simulated into `out` if not installed.
     """

@@ -161,7 +161,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> JudgedResult:
         ) as partial,
     ):
         job = _read(request, stopwatch, progress)
-        for path in partial.iterdir():  # all but the channels of an interrupted bake: it is written again
+        for path in partial.iterdir():  # all but an interrupted bake's channels is written again
             if path.name != FOLDER:
                 remove(path)
         with stopwatch.stage("bake"), closing(job.baker), explain_faults(job.device, checkpoint):

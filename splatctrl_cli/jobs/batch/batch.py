@@ -120,7 +120,7 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
-    """Judge a batch: each node has a reason, passed if it ended as expected."""
+    """Judge a batch: each node has a reason, passed if the node ended as expected."""
     num = len({run.recording for run in runs})
     damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
     return verdict_of(
@@ -224,7 +224,7 @@ def write_batch(
 def scheduling(
     ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
 ) -> Iterator[Scheduler]:
-    """Yield a scheduler of local processes or a Dask cluster. Raises UsageError if none answers."""
+    """Yield a scheduler: local processes or a Dask cluster. Raises UsageError if no scheduler answers."""
     scheduler = partial(Scheduler, ledger=ledger, entry=entry, progress=progress, again=again)
     if dask is None:
         with local_executor(workers) as executor:

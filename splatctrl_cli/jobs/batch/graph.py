@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.batch.suite import Job, Recording, Suite, Table, jobs_fo
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
 CAPTURE, SCENE = "ingest", "reconstruct"
-ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a command's only job, or the recording
+ROLES: Mapping[str, Mapping[str, str]] = {  # defaults of options: the only job of a command, or the recording
     "simulate": {},
     "ingest": {"source": RECORDING},
     "check": {"source": RECORDING},
@@ -40,7 +40,7 @@ class CommandLine(Protocol):
     entry: ClassVar[str]
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options with paths relative to `folder`, and the files that they read.
+        """Words for options with paths relative to `folder`, and the files they read.
 
         Raises UsageError for an unknown option.
         """
@@ -68,7 +68,7 @@ class Node:
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
-    """All nodes, by recording, each after the nodes that it needs.
+    """All nodes, by recording, each after the nodes it needs.
 
     Raises UsageError for a cycle, an unknown placeholder or option.
     """

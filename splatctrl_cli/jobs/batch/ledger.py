@@ -240,7 +240,7 @@ def run_of_document(plain: Mapping[str, Any]) -> Run:
 
 
 def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
-    """Key of each node, after those it needs. Raises InputError for a missing input."""
+    """Key of each node; needed nodes come first. Raises InputError for a missing input."""
     code, digests = code_version(), dict[Path, str]()
     keys: dict[str, str] = {}
     outs = {node.name: str(node.out) for node in nodes}

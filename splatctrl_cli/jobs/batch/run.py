@@ -22,8 +22,8 @@ from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 DISK_FULL = 6  # exit code
-AGAIN_S = 0.5  # between looks at what another batch runs
-STILL_S = 60.0  # without an ended node, until a log line names what runs
+AGAIN_S = 0.5  # between looks at nodes that another batch runs
+STILL_S = 60.0  # without an ended node, until a log line names a running node
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes that this batch did not ask for
 PRINTED = "printed"  # stamp of a node that only prints
 
@@ -223,7 +223,7 @@ def local_executor(workers: int) -> Iterator[Executor]:
 
 
 class Clock:
-    """Count of finished nodes, and time left by the mean time of each job."""
+    """Count of finished nodes, and time left by each job's mean time."""
 
     def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
         self.started = time.time()

@@ -271,7 +271,7 @@ class WorstState:
 
 
 def worst_state(folder: Path | None, metric: str) -> WorstState | None:
-    """Worst state of a replay by a metric; None if no state shows the metric."""
+    """Replay's worst state by a metric; None if no state shows the metric."""
     where = shown().get(metric)
     if where is None or folder is None or not (folder / "steps.csv").is_file():
         return None

@@ -68,8 +68,9 @@ def scene_answers(
 ) -> Callable[..., Answers]:
     """Return a function that answers from splats and balls around unrepresented voxels.
 
-    It takes points (Q, 3) [m], world. Given a grid's answers, it completes them, with the probability at the grid's
-    distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
+    It queries the field of `config` at points (Q, 3) [m], world. Given a grid's answers, it completes them, with the
+    probability at the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved
+    space.
     """
     refuse_if(
         config.field.unknown != "free",

@@ -1,4 +1,4 @@
-"""Time steps that leave a map: due steps, and steps with a new obstacle."""
+"""Time steps that leave a map: due, or with a new obstacle."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 
 class KeptMaps:
-    """Decisions on snapshots from written files only, so that a resumed run decides the same."""
+    """Decisions on snapshots from written files only, so a resumed run decides the same."""
 
     def __init__(self, writer: SceneWriter, config: Config) -> None:
         self._writer, self._config = writer, config

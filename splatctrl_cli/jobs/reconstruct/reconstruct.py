@@ -187,7 +187,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     except InputError as error:
         if any((request.urdf, request.spheres, request.self_model)):
             raise
-        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # nobody asked for it
+        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # not requested
         return None
     for doubt in model.doubts:
         progress.log(f"warning: {doubt}")
@@ -206,7 +206,7 @@ def _check_has_states(source: RecordSource) -> None:
 class LearnRequest(RobotOptions):
     """Learn the self-model of the robot `urdf` from `log` into `out`.
 
-    reach [m]: how far outside a link's visual surface parts are sought.
+    reach [m]: how far outside a link's visual surface to look for parts.
     """
 
     log: Path

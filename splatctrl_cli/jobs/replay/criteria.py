@@ -55,7 +55,7 @@ def worst_state(
 ) -> Reason | None:
     """Value that `pick` chooses, as a reason without a sentence; None without values.
 
-    values (T,), who (T,): names.
+    values: (T,). who: names (T,).
     """
     count = int(np.sum(~np.isnan(values)))
     if not count:
@@ -80,8 +80,8 @@ class Bound:
 
     on: a column (T,) of the trace, (T, K) for the least of `parts`, or a function that returns the worst value. who:
     column of names. at_most, at_least: the allowed value, or a function of the input; `tolerance` widens it. above:
-    without either, the value must exceed this (0: the margin). say, passed: sentences; without `passed`, a pass
-    yields none. quantity, why: for the documentation.
+    without either, the value must exceed this (0: the margin). say, passed: sentences; without `passed`, a pass gives
+    no reason. quantity, why: for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]

@@ -182,9 +182,9 @@ def misses_of(
 ) -> tuple[list[int], Float64, int]:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Returns stamps [ns] of the T sets in the audited time, (T, 4) [m], and the number of points. The columns are the
-    largest miss and its place, NaN without points. Near means within `reach` [m]. Each set is compared with the map
-    just before it: the next map contains other cameras of that moment, and misses less.
+    Returns stamps [ns] of the T sets in the audited time, an array (T, 4) [m], and the number of points. Its columns
+    are the largest miss and the place, NaN without points. Near means within `reach` [m]. Each set is compared with
+    the map just before it: the next map contains other cameras of that moment, and misses less.
     """
     swept, cameras = Swept.of(inputs.model, trace, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(trace.stamp_ns[0]), int(trace.stamp_ns[-1])
@@ -220,7 +220,7 @@ def surface_points(frame: RgbdFrame) -> Float64:
 def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
     """Keep points (Q, 3) [m] that cannot be the robot at q (J,).
 
-    These are over ROBOT_MARGIN outside its spheres, each enlarged by the surface it leaves uncovered.
+    These are over ROBOT_MARGIN outside the robot's spheres, each enlarged by the surface it leaves uncovered.
     """
     if not len(points):
         return points
@@ -265,7 +265,7 @@ class Swept:
         return cls(cells, radii, reach)
 
     def near(self, points: Float64) -> Float64:
-        """Keep the points (Q, 3) [m] inside the swept space."""
+        """Keep points (Q, 3) [m] inside the swept space."""
         inside = points[self._box.contains(points)]
         return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside
 

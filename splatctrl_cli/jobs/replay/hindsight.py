@@ -14,9 +14,7 @@ from splatctrl_cli.records import Float64, Stamps
 STEP_NS = 100_000_000  # between looks after a motion
 
 ClearanceIn = Callable[[int, Stamps, Float64], Float64]
-"""Function of a scene's stamp, state stamps (T,) and positions (T, J) to clearances (T,) [m] without declared
-contact.
-"""
+"""Function of a scene's stamp, stamps (T,), positions (T, J): clearances (T,) [m] without declared contact."""
 
 
 @dataclass(frozen=True, kw_only=True)

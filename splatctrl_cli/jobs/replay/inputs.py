@@ -264,7 +264,7 @@ class LoggedStates:
 
 
 def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:
-    """Read the robot's states; `clock_of` needs the frames, too.
+    """Read the robot's states; their clock offset needs frames, too (`clock_of`).
 
     Raises InputError if the states cannot be the robot's.
     """

@@ -28,7 +28,7 @@ from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, See
 
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
-ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
+ROUNDING = 1e-5  # [m] subtracted from distances to splats, far above what float32 rounds within 8 m
 NUM_CACHED = 3  # scenes whose fields are kept: the last, this and the next
 
 
@@ -36,9 +36,9 @@ NUM_CACHED = 3  # scenes whose fields are kept: the last, this and the next
 class KnownFields:
     """Fields of one scene: `barrier` for a controller, `distances` for an audit.
 
-    obstacles: of points (Q, 3) [m], world, the nearest obstacle of each. human: field of people only. splats_alone:
-    exact distance without voxels that no splat represents. is_person (N,): balls of the exact distance that are
-    people, None for a grid. balls: the barrier's balls; None for a grid, or if people have a larger margin.
+    obstacles: function of points (Q, 3) [m], world, to each one's nearest obstacle. human: field of people only.
+    splats_alone: exact distance without voxels that no splat represents. is_person (N,): balls of the exact distance
+    that are people, None for a grid. balls: the barrier's balls; None for a grid, or if people have a larger margin.
     """
 
     barrier: DistanceField
@@ -89,7 +89,7 @@ class KnownScene:
         return None if index < 0 else self.stamps_ns[index]
 
     def step_at(self, stamp_ns: int) -> SceneStep | None:
-        """Two newest scenes at a stamp, None if there is only one."""
+        """Two newest scenes at a stamp, None with only one."""
         index = self._index_at(stamp_ns)
         if index < 1:
             return None

@@ -161,8 +161,8 @@ class Lockstep:
     """Frame sets to come, and stamps and files of maps so far.
 
     ends_with_log: known space is that of the whole log, else of the frame sets taken. is_real_time: each map but the
-    first is known when this machine has computed it (its known space when that begins). Of the frame sets that arrive
-    meanwhile, only the newest is kept. held_out_every: k if each k-th set is evidence and left out.
+    first is known when this machine has computed it (its known space when the computation begins). Of the frame sets
+    that arrive meanwhile, only the newest is kept. held_out_every: k if each k-th set is evidence and left out.
     """
 
     def __init__(

@@ -328,7 +328,7 @@ def metrics_of(replay: Replay) -> Metrics:
 
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
-    """Number of states, intervals, spheres or points behind each metric, by default of judged states."""
+    """Number of states, intervals, spheres or points behind each metric, by default judged states."""
     counts = dict.fromkeys(metrics, replay.num_states)
     counts |= {metric.name: metric.count(replay) for metric in _metrics_of(replay)}
     for field, agreement in replay.agreement.items():

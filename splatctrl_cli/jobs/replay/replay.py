@@ -156,7 +156,7 @@ def _notes(judged: Judged) -> Iterator[str]:
 
 
 def waivers(request: ReplayRequest) -> Iterator[str]:
-    """Settings of evidence and margins that are laxer than their defaults."""
+    """Settings of evidence and margins laxer than their defaults."""
     usual = ReplayRequest(log=request.log, out=request.out)
     for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
         value, default = (attrgetter(name)(each) for each in (request, usual))

@@ -195,7 +195,7 @@ class SeparationInput:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneChange:
-    """Newer scene; before, after: clearance [m] of the unmoved arm without and with it."""
+    """Newer scene; before, after: least clearance [m] of the unmoved arm's surface without and with it."""
 
     stamp_ns: int
     before: float

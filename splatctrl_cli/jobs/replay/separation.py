@@ -246,7 +246,7 @@ class _SeparationPass:
     def _stop_clearance(
         self, robot: RobotModel, q: Float64, motion: ArmMotion, stop: Stop, statics: "_Balls | None"
     ) -> Float64:
-        """Bound (T,) [m] of the clearance to static surfaces along a straight stop in joint space."""
+        """Lower bound (T,) [m] of the clearance to static surfaces along a straight stop in joint space."""
         way = motion.joint_speed * self._number["T_r"] + np.sign(motion.joint_speed) * stop.joint_travel
         shares = np.linspace(0.0, 1.0, STOP_POSTURES)
         postures = (q[:, None] + shares[:, None] * way[:, None]).reshape(-1, q.shape[1])

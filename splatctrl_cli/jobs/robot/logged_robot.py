@@ -57,7 +57,7 @@ class RobotOptions:
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
-    """Robot described by logs, or None. Raises InputError for several or an invalid one."""
+    """Robot described by logs, or None. Raises InputError for several robots or an invalid one."""
     robots = logged_descriptions(paths)
     refuse_if(
         len(robots) > 1,
@@ -125,7 +125,7 @@ def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
-    """Describe how a model differs from every robot in the logs; empty if one agrees."""
+    """Difference of a model from every logged robot; empty if one agrees."""
     words = []
     for path, where, text in logged_descriptions(paths):
         try:

@@ -114,7 +114,7 @@ class RunFolder:
     def place_of(self, word: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
         """Find a command line's path: as typed, in a parent folder, or in `roots`.
 
-        None if it is missing, or its digest is not `digest`.
+        None if missing, or if its digest is not `digest`.
         """
         above = [Path(), *self.path.absolute().parents, *roots]
         places = [root / word for root in above if (root / word).exists()]
@@ -138,7 +138,10 @@ def sibling_path(path: Path, ending: str) -> Path:
 
 
 def open_run(path: Path) -> RunFolder:
-    """Open a run's folder. Raises InputError if it is no run, incomplete, or newer."""
+    """Open a run's folder.
+
+    Raises InputError if it is no run, incomplete, or of a newer version.
+    """
     partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
     refuse_if(
         partial.exists() and (partial == path or not path.exists()),

@@ -77,7 +77,7 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> JudgedResult:
     Document: ``score.json``.
     """
     if request.baseline is not None:
-        read_baseline(request.baseline)  # refuses it before the views are scored
+        read_baseline(request.baseline)  # refuse a bad baseline before the views are scored
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
@@ -264,7 +264,7 @@ def _score_scans(
     results: dict[str, JudgedResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
-        # gates and baseline apply to the means alone
+        # gates and baseline apply only to the means
         alone = replace(
             request, scene=scene, recording=select_scan(request.recording, scan), require=(), baseline=None
         )

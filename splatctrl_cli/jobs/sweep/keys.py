@@ -64,7 +64,7 @@ KEYS = {
 
 
 def key_of(name: str) -> Key:
-    """Key by name, or a numeric setting ``SECTION.KEY``. Raises UsageError for others."""
+    """Key by name, or a numeric setting ``SECTION.KEY``. Raises UsageError for other names."""
     if name in KEYS:
         return KEYS[name]
     section, _, setting = name.partition(".")

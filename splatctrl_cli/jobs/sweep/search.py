@@ -43,7 +43,8 @@ def find_flip(
     """Find the flip nearest to `start`, to within `tolerance` (1 for whole values).
 
     judge: outcomes of several values, in parallel. It tries the ends and SWEEP_SAMPLES values between, or
-    SWEEP_SEARCHED if the outcome may change more than once. Then it bisects the nearest pair with different outcomes.
+    SWEEP_SEARCHED if the outcome may or does change more than once. Then it bisects the nearest pair with different
+    outcomes.
     """
     known: dict[float, str] = {}
 
