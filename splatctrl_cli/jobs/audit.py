@@ -1,4 +1,4 @@
-"""An audit: a recording to a verdict and one page, by steps in one folder."""
+"""An audit: steps in one folder, from a recording to a verdict and one page."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf, visual_urdf
 
 PAIR = "the last photo on the left, the map's render on the right; drag the photo's lower corner"
-WIDTH = 640  # of these [px]
+WIDTH = 640  # of the views [px]
 STEPS, RUN = "steps.json", "run.json"
 CHECK, PAGE = "check.json", "report.html"
 SCENE, LOGGED, DRIVEN = "scene", "replay", "closed_loop"
@@ -52,11 +52,12 @@ TITLES = {LOGGED: "Logged motion", DRIVEN: "Driven motion", SCENE: "Map"}  # of 
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRequest(RobotOptions, RunOptions):
-    """An audit of `log`, read by `options`, into the folder `out`.
+    """An audit of `log`, read with `options`, into the folder `out`.
 
-    urdf: the robot, or robot: its name, see `installed_urdf`; without both the log's own. goal (x, y, z, qx, qy, qz,
-    qw in world) or goal_joints [rad] adds a closed loop that drives the link `frame`. force: repeat all steps.
-    resume: continue an interrupted reconstruction. words: options that the steps share, for their ``run.json``.
+    urdf: the robot's file; robot: name of an installed one (`installed_urdf`). Without both, the log's robot. goal
+    (x, y, z, qx, qy, qz, qw in world) or goal_joints [rad] adds a closed loop that drives the link `frame`. force:
+    repeat all steps. resume: continue an interrupted reconstruction. words: options that the steps share, for their
+    ``run.json``.
     """
 
     log: Path
@@ -73,7 +74,7 @@ class AuditRequest(RobotOptions, RunOptions):
 
 @dataclass(kw_only=True)
 class _Steps:
-    """The steps in `folder`; done: inputs and digest of each."""
+    """Steps in `folder`; done: digests of inputs and output by step."""
 
     folder: Path
     inputs: Mapping[str, object]
@@ -84,7 +85,7 @@ class _Steps:
     def make(
         self, name: str, file: str, write: Callable[[], object], words: Sequence[str] = (), **more: object
     ) -> None:
-        """Write `file`, unless the same inputs made it already.
+        """Write `file`, unless the same inputs already made it.
 
         words: the equivalent command line.
         """
@@ -101,11 +102,10 @@ class _Steps:
 
 
 def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
-    """Check, reconstruct, replay and write the page; leave out what the same inputs made before.
+    """Check, reconstruct, replay and write the page; skip steps that the same inputs made.
 
-    A log without joint states is not evaluable: its check and map stand alone. Document: the page, and the steps
-    that this call made. Raises UsageError for an unknown
-    robot, WriteError for an unwritable page, and what the steps raise.
+    A log without joint states is not evaluable: only its check and map are made. Document: the page, and the steps
+    made now. Raises UsageError for an unknown robot, WriteError for an unwritable page, and errors of the steps.
     """
     source = open_source(request.log, request.options)
     if request.robot is not None:
@@ -165,7 +165,7 @@ def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
 
 
 def _replays(request: AuditRequest) -> dict[str, ReplayRequest]:
-    """Replays by folder, of a driven motion with a goal alone."""
+    """Replays by folder; a driven motion only with a goal."""
     logged = ReplayRequest(
         log=request.log,
         options=request.options,
@@ -212,7 +212,7 @@ def _goal(request: ReplayRequest) -> list[str]:
 
 
 def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
-    """Make the folder; return the steps done in it, none to repeat."""
+    """Make the folder; return the steps done in it, none with `force`."""
     out, file, other = request.out, request.out / STEPS, "give another --out"
     with refuse_faults(
         lambda error: f"{out}: cannot be written: {error.strerror}", OSError, remedy=other, error=UsageError

@@ -31,10 +31,11 @@ BASE = "the robot's base"
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateRequest(SessionRequest, RobotOptions):
-    """Calibrate the cameras of a recording.
+    """Calibration of a recording's cameras.
 
-    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera
-    without a robot (None: the first). board: for initial poses. allow_unobserved: write an incomplete calibration.
+    out: None for calibration.toml here. urdf: a recorded robot to place cameras against. hold: the fixed camera. None
+    fixes the first if there is no robot or moving camera. board: for initial poses. allow_unobserved: write an
+    incomplete calibration.
     """
 
     out: Path | None = None
@@ -47,9 +48,9 @@ class CalibrateRequest(SessionRequest, RobotOptions):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class CalibrateResult(Result):
-    """The written calibration, and distances [m] to what another camera or the robot shows.
+    """Written calibration, and distances between surfaces that cameras or robot show.
 
-    before, after: `Adjustment.distance`. moved: by camera [m], [deg].
+    before, after [m]: `Adjustment.distance`. moved: translation [m] and rotation [deg] by camera.
     """
 
     calibration: Calibration
@@ -225,7 +226,7 @@ def depth_frame(stored: StoredFrame) -> RgbdFrame:
 
 
 def _choose_fixed(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
-    """Fixed cameras: of --hold; else none with a robot or moving camera; else the first."""
+    """Fixed cameras: --hold's, else none with a robot or moving camera, else the first."""
     refuse_if(
         request.hold is not None and request.hold not in cameras,
         f"--hold {request.hold}: no such camera",

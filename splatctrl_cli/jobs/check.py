@@ -1,4 +1,4 @@
-"""Faults of a recording, before they cost an hour; its conversion into a capture."""
+"""Check of a recording for faults, and its conversion into a capture."""
 
 import json
 import statistics
@@ -28,7 +28,7 @@ from splatctrl_cli.robot.sphere_files import own_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 
-_ALLOWING = {  # the options that take an error on
+_ALLOWING = {  # options that accept an error
     **dict.fromkeys(("agreement", "views-agreement", "views-scale", "alignment"), "--allow-disagreement"),
     "pose-jump": "--max-pose-jump",
 }
@@ -44,10 +44,10 @@ class SessionRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckRequest(SessionRequest, RobotOptions):
-    """One check of a recording.
+    """Check of a recording.
 
-    num_images: of each topic, None for all. urdf: robot to compare with; with `spheres` alone the log's. fail_on:
-    least severity that fails: "error", "warning" or "never".
+    num_images: images per topic, None for all. urdf: robot to compare with; if only `spheres` is given, the log's.
+    fail_on: least severity that fails: "error", "warning" or "never".
     """
 
     num_images: int | None = None
@@ -76,7 +76,7 @@ def check(request: CheckRequest) -> tuple[CheckReport, Verdict]:
 
 
 def refuse_errors(path: Path, options: SourceOptions, allowed: Collection[str] = ()) -> None:
-    """Raise InputError if `check` finds an error for reconstruct, except `allowed` codes."""
+    """Raise InputError if `check` finds an error that blocks reconstruct, except `allowed` codes."""
     report = _report(CheckRequest(paths=(path,), options=options), None, only_errors=True)
     if errors := [f for f in report.blockers("reconstruct") if f.code not in allowed]:
         first, more = errors[0], f"; {len(errors) - 1} more: splatctrl check {path}" if len(errors) > 1 else ""
@@ -96,9 +96,9 @@ def _report(request: CheckRequest, model: RobotModel | None, *, only_errors: boo
 
 
 def pose_robot(paths: Sequence[Path], urdf: Path | None, options: RobotOptions) -> RobotModel | None:
-    """Robot of a URDF, with spheres alone the recording's own; None without either.
+    """Robot of `urdf`, or if only spheres are given, of the recording; None without either.
 
-    Raises UsageError for robot options without one.
+    Raises UsageError for robot options without a robot.
     """
     file = None if urdf is None else read_urdf(urdf)
     if file is None and options.spheres is not None:  # without spheres it is often unusable
@@ -175,7 +175,7 @@ DECIDING_PACKAGES = ("numpy", "opencv-python-headless")  # whose versions may ch
 
 @dataclass(frozen=True, kw_only=True)
 class IngestRequest(SessionRequest):
-    """Write a recording as a capture; out: None for NAME.capture here, by the first path."""
+    """Recording to write as a capture; out: None for NAME.capture, by the first path."""
 
     out: Path | None = None
     force: bool = False

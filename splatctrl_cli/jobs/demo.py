@@ -1,4 +1,4 @@
-"""The main jobs on the sample recording, with pictures."""
+"""Main jobs on the sample recording, with pictures."""
 
 import shlex
 from collections.abc import Callable, Sequence
@@ -30,14 +30,14 @@ AGAINST = f"replay {CAPTURE} --scene {{out}}/scene {ROBOT} {TRUTH}"
 STEPS = {  # command lines, each with the labels that are right, joined by "or"
     "info {data}/log.mcap": "done",
     f"ingest {{data}}/log.mcap -o {CAPTURE}": "done",
-    # 5000 splats are full when the visitor comes
+    # 5000 splats are all in use when the visitor comes
     f"reconstruct {CAPTURE} {TRAINED} --max-splats 8000 {ROBOT} -o {{out}}/scene {USING}": "passed",
     "export {out}/scene -o {out}/tabletop.ply": "done",
     f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}": "passed",
     f"score {{out}}/scene --reference {CAPTURE} --cameras {SCORED} -o {{out}}/score {USING}": "passed",
     f"{AGAINST} -o {{out}}/audit {USING}": "safe",
-    # from 1.8 s on the visitor appears ahead of the driven arm, earlier right where it is; the arm presses on its
-    # margin, by a map that errs by mm
+    # before 1.8 s the visitor would appear inside the driven arm; the arm goes up to its margin, in a map that errs
+    # by millimetres
     f"{AGAINST} --mode closed-loop --start-time 1.8 -o {{out}}/closed_loop {USING}": (
         "safe or not evaluable or margin broken"
     ),
@@ -50,12 +50,12 @@ PICTURES = {
 }
 
 Perform = Callable[[Sequence[str], Path], str]
-"""Run a command line that writes into the folder; return its label: a verdict's, "done" or "exit code N"."""
+"""Run a command line that writes into the folder; return its verdict's label, "done" or "exit code N"."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRequest:
-    """Run on `data`, a folder of `splatctrl simulate`, and write into `out`.
+    """Demo on `data`, a folder of `splatctrl simulate`, into the folder `out`.
 
     data: None for the sample recording, simulated into `out` if not installed.
     """

@@ -32,12 +32,12 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")  # [m], of T_world_camera
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSceneRequest:
-    """A picture (``.png``), video (``.mp4``) or folder of pictures `out` of the folder `scene`.
+    """Picture (``.png``), video (``.mp4``) or folder of pictures `out` of the folder `scene`.
 
-    camera: a training camera, None for the first. It stands where its first frame was, or moves as in the recording
-    `reference`, or along `path`: a CSV or JSON file of rows time_s, x, y, z, qx, qy, qz, qw, the pose of the optical
-    frame in world. at: time after the first snapshot [s], None for all times, of a picture the last. size: width and
-    height [px], None for the camera's. fps: pictures a second. depth: colour by depth.
+    camera: a training camera, None for the first. It stays at its first frame's pose, or moves as in the recording
+    `reference`, or along `path`. path: a CSV or JSON file of rows time_s, x, y, z, qx, qy, qz, qw, the optical
+    frame's pose in world. at: time after the first snapshot [s]; None for all times, or the last for a picture. size:
+    width and height [px], None for the camera's. fps: pictures per second. depth: colour by depth.
     """
 
     scene: Path
@@ -61,7 +61,7 @@ class _Track:
     poses: Float64
 
     def pose(self, time_s: float) -> Float64:
-        """Pose at a time, between two of the track interpolated, outside it the nearest."""
+        """Pose at a time: interpolated between two poses, the nearest outside the track."""
         after = int(np.searchsorted(self.times, time_s))
         if after in {0, len(self.times)}:
             return np.asarray(self.poses[min(after, len(self.times) - 1)])
@@ -125,7 +125,7 @@ def _camera(request: RenderSceneRequest, scene: SceneFolder) -> tuple[Intrinsics
 
 
 def _resize(lens: Intrinsics, width: int, height: int) -> Intrinsics:
-    """Camera of another size with the same vertical view; its middle stays the middle."""
+    """Camera of another image size, with the same vertical view and middle ray."""
     factor = height / lens.height
     return Intrinsics(
         fx=factor * lens.fx,
@@ -153,7 +153,7 @@ def _read_path(file: Path) -> _Track:
 
 
 def _stamps(scene: SceneFolder) -> list[int]:
-    """Stamps of the snapshots [ns], none of a scene without times."""
+    """Stamps of the snapshots [ns], none for a scene without times."""
     has_times = scene.has_clock and not scene.is_anisotropic
     return [snapshot.stamp_ns for snapshot in scene.snapshots] if has_times else []
 
@@ -183,9 +183,9 @@ def _times(request: RenderSceneRequest, scene: SceneFolder, track: _Track) -> li
 def _images(
     request: RenderSceneRequest, scene: SceneFolder, lens: Intrinsics, track: _Track, times: Sequence[float]
 ) -> Iterator[UInt8]:
-    """Pictures (H, W, 3), RGB; of depth from red (near) to blue (far).
+    """Pictures (H, W, 3), RGB; depth is red (near) to blue (far).
 
-    The first picture's farthest depth is blue. No depth is black.
+    Blue is the first picture's farthest depth. Pixels without depth are black.
     """
     splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))
     stamps, farthest = _stamps(scene), 0.0
@@ -202,7 +202,7 @@ def _quantise(color: Float32) -> UInt8:
 
 
 def render_newest(scene: SceneFolder, source: FrameSource, threads: int = 0) -> Iterator[tuple[RgbdFrame, UInt8]]:
-    """Yield each training camera's last frame, and the scene as known then (H, W, 3), RGB."""
+    """Yield each training camera's last frame, and its render as known then (H, W, 3), RGB."""
     stored = (item for item in source.stored() if isinstance(item, StoredFrame))
     newest = {item.camera: item for item in stored if item.camera in scene.cameras}
     off, has_times = scene.run.get("metrics", {}).get("displaced_cameras") or {}, bool(_stamps(scene))

@@ -40,9 +40,9 @@ SUMMARY_METRICS = {
 def accuracy_of(
     grid: DistanceGrid, spheres: Spheres, source: BakeSource, request: BakeRequest
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Reliability]]:
-    """Errors of a field by reference requested, as in ``field.json``, and reliability against the truth.
+    """Errors of a field by requested reference, as in ``field.json``, and reliability against the truth.
 
-    Raises NotEvaluableError without overlap.
+    Raises NotEvaluableError if field and reference do not overlap.
     """
     compared, curves = dict[str, dict[str, Any]](), dict[str, Reliability]()
     if request.truth is not None:
@@ -139,7 +139,7 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Return the named cameras, or all not known to have trained."""
+    """Named cameras, or all but known training cameras."""
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")
@@ -202,7 +202,7 @@ def summary_of(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def metrics_of(summary: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]]) -> dict[str, float | None]:
-    """Figures a gate can name: of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
+    """Figures a gate can name: the summary's, and the truth's, like ``seen.hard.0_2cm.rmse``, ``over_estimate.*``."""
     of_truth = figures_of(accuracy["truth"]) if "truth" in accuracy else {}
     return {name: summary[name] for name in SUMMARY_METRICS} | of_truth
 

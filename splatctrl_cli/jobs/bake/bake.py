@@ -76,7 +76,7 @@ def bake_to_disk(
     """Bake the channels into ``partial/channels``; the baker's counts then cover all slabs.
 
     earlier: unchanged cells of an update; unknown: treatment of unobserved space. --resume continues after the last
-    slab. Raises UsageError for other settings than that bake's, or too little room on disk or in memory.
+    slab. Raises UsageError for settings other than the interrupted bake's, or too little disk or memory.
     """
     baker, request, folder = job.baker, job.request, partial / FOLDER
     layout, config = baker.layout, request.config
@@ -161,7 +161,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> JudgedResult:
         ) as partial,
     ):
         job = _read(request, stopwatch, progress)
-        for path in partial.iterdir():  # all but the channels of an interrupted bake: it is written again
+        for path in partial.iterdir():  # all but an interrupted bake's channels is written again
             if path.name != FOLDER:
                 remove(path)
         with stopwatch.stage("bake"), closing(job.baker), explain_faults(job.device, checkpoint):
@@ -333,7 +333,7 @@ def _draw(
 
 
 def _middle(job: _Job) -> list[float]:
-    """Point [m] of the slices: the middle of the grid's splats without outliers."""
+    """Point [m] of the drawn slices: the middle of the grid's splats without outliers."""
     box, centers = job.baker.layout.box, job.obstacles.splats.centers
     inside = centers[box.contains(centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)

@@ -28,12 +28,13 @@ from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 @dataclass(frozen=True, kw_only=True)
 class BakeRequest(RunOptions):
-    """One bake of `scene` (reconstruct's folder, or a splat file) into the folder `out`.
+    """Bake of `scene` (reconstruct's folder, or a splat file) into the folder `out`.
 
     at: time after the scene's start [s], None for its end. labels: of the splats in the field. The grid covers `box`,
-    or the robot's reach, or the splats. channels: besides sdf, None for the usual ones. References: `truth`, where
-    cameras of `seen_by` looked; `reference_mesh`; depth in the log `held_out` (`held_out_cameras`; none: all that did
-    not train). update: a field of `previous_scene` (None: `scene`); only changes are baked.
+    else the robot's reach, else the splats. channels: besides sdf, None for the default set. The field is compared
+    with `truth` where cameras of `seen_by` looked, `reference_mesh`, and depth in the log `held_out`.
+    held_out_cameras: empty for all that did not train. update: an earlier field of `previous_scene` (None: `scene`);
+    only changes are baked.
     """
 
     scene: Path
@@ -64,7 +65,7 @@ class BakeRequest(RunOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
-    """Splats with the occupancy of the same moment, None for a bare splat file.
+    """Splats and the occupancy of the same moment, which a bare splat file lacks.
 
     unrepresented: occupied voxels without a splat. workspace: the box outside which no splats are kept.
     """
@@ -82,7 +83,8 @@ class BakeSource:
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     """Read the splats at `path`, as known `at_seconds` after the first snapshot (None: the end).
 
-    Raises InputError without a scene, UsageError for a time in a bare file, NotEvaluableError for too early a time.
+    Raises InputError without a scene, UsageError for a time in a bare splat file, NotEvaluableError without a
+    snapshot then.
     """
     refuse_if(
         not path.exists(), f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply"
@@ -123,7 +125,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """A baked field with its run.json and the source of its splats."""
+    """Baked field with its run.json and the source of its splats."""
 
     path: Path
     grid: DistanceGrid
@@ -133,7 +135,7 @@ class Previous:
 
     @property
     def box(self) -> Box:
-        """Box of the cell centres: with the same voxel it gives the same cells."""
+        """Box of the cell centres; the same box and voxel give the same cells."""
         x, y, z = self.grid.channels["sdf"].shape
         return GridLayout(origin=self.grid.origin, voxel=self.grid.voxel, shape=(x, y, z)).box
 
@@ -198,7 +200,7 @@ def check_same(
 def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
     """Read the splats of `scene` at the grid's time.
 
-    Raises UsageError, starting with `where`, if the grid was not baked from them.
+    Raises UsageError, starting with `where`, if the grid was not baked from these splats.
     """
     digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
     wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None
@@ -218,7 +220,7 @@ def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
 
 
 def choose_box(request: BakeRequest, source: BakeSource, previous: Previous | None) -> Box:
-    """Box of the grid: given, else of the reach, the previous field, or the splats."""
+    """Box of the grid: given, else of the robot's reach, previous field, or splats."""
     if request.box is not None:
         return request.box
     if request.urdf is not None:

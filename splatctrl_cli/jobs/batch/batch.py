@@ -37,10 +37,10 @@ CONNECT_S = 10.0  # to a scheduler
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRequest:
-    """Run a suite's file into `out` (default: the suite's).
+    """A run of a suite's file into `out` (default: the suite's).
 
-    workers: processes at once. shard: (i, n) runs every n-th recording from the i-th on. dask: address of a Dask
-    scheduler to use instead. again: rerun finished nodes.
+    workers: number of processes. shard: (i, n) runs every n-th recording from the i-th on. dask: address of a Dask
+    scheduler instead of local processes. again: rerun finished nodes.
     """
 
     suite: Path
@@ -53,7 +53,7 @@ class BatchRequest:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class BatchResult(JudgedResult):
-    """Runs of all nodes in graph order; num_kept of them from before."""
+    """Runs of all nodes in graph order; `num_kept` are from earlier batches."""
 
     out: Path
     suite: str
@@ -77,7 +77,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
         finally:
-            if scheduler.keys:  # it knows what each node is to be
+            if scheduler.keys:  # the key of each node is known
                 write_batch(out, suite, every, ledger.latest(), scheduler.keys)
     document = {"out": out, "suite": suite.name, "kept": scheduler.num_kept}
     return BatchResult(
@@ -92,7 +92,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
 
 
 def plan_batch(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], list[Node], Path]:
-    """The suite, its nodes in order, those of this shard, and the output folder.
+    """Suite, all its nodes in order, this shard's nodes, and the output folder.
 
     Raises UsageError for a shard without a recording.
     """
@@ -111,7 +111,7 @@ def plan_batch(request: BatchRequest, command_line: CommandLine) -> tuple[Asked,
 
 
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
-    """Every node with "done" or "to do"; writes nothing but a ledger's digests."""
+    """Every node of the shard, "done" or "to do"; writes only the ledger's digests."""
     *_, nodes, out = plan_batch(request, command_line)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
@@ -120,7 +120,7 @@ def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node
 
 
 def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
-    """Judge a batch: each node has a reason, passed if it ended as expected."""
+    """Judge a batch: each node has a reason, passed if the node ended as expected."""
     num = len({run.recording for run in runs})
     damaged = dict.fromkeys(run.recording for run in runs if _is_damaged(run))
     return verdict_of(
@@ -154,7 +154,7 @@ def suites_of(result: BatchResult) -> list[Suite]:
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
         cases = [
-            replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has its time
+            replace(case, seconds=0.0 if number else run.seconds)  # the first case of a node has the node's time
             for run in runs
             for number, case in enumerate(_cases_of(run, result.out))
         ]
@@ -198,9 +198,9 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
 def write_batch(
     out: Path, suite: Asked, nodes: Sequence[Node], latest: Mapping[str, Run], keys: Mapping[str, str]
 ) -> None:
-    """Write batch.json: every node with a key, and the last run of others.
+    """Write batch.json: every node with a key, and the last run of other nodes.
 
-    Nodes not reached have the state "to do".
+    Nodes still to run have the state "to do".
     """
     runs = list[Run]()
     for node in nodes:
@@ -224,7 +224,7 @@ def write_batch(
 def scheduling(
     ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
 ) -> Iterator[Scheduler]:
-    """Yield a scheduler of local processes or a Dask cluster. Raises UsageError if none answers."""
+    """Yield a scheduler: local processes or a Dask cluster. Raises UsageError if no scheduler answers."""
     scheduler = partial(Scheduler, ledger=ledger, entry=entry, progress=progress, again=again)
     if dask is None:
         with local_executor(workers) as executor:

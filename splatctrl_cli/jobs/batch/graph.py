@@ -1,4 +1,4 @@
-"""The graph of a suite: nodes of recording, job and variant."""
+"""Graph of a suite: one node per recording, job and variant."""
 
 import itertools
 import json
@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.batch.suite import Job, Recording, Suite, Table, jobs_fo
 RECORDING, NAME = "recording", "name"  # placeholders {…} in an option, besides job names
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
 CAPTURE, SCENE = "ingest", "reconstruct"
-ROLES: Mapping[str, Mapping[str, str]] = {  # default sources of options: a command's only job, or the recording
+ROLES: Mapping[str, Mapping[str, str]] = {  # defaults of options: the only job of a command, or the recording
     "simulate": {},
     "ingest": {"source": RECORDING},
     "check": {"source": RECORDING},
@@ -35,26 +35,26 @@ Variant = Mapping[str, Any]
 
 
 class CommandLine(Protocol):
-    """Command line of a batch's nodes; `entry` is MODULE:FUNCTION, from words to exit code."""
+    """Command line of batch nodes; `entry`: MODULE:FUNCTION from words to exit code."""
 
     entry: ClassVar[str]
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options, whose paths are relative to `folder`, and the files they read.
+        """Words for options with paths relative to `folder`, and the files they read.
 
         Raises UsageError for an unknown option.
         """
 
     def options_of(self, words: Sequence[str]) -> dict[str, Any]:
-        """Options in a command's words, as `parsed` takes them, without those a batch gives."""
+        """Options in a command's words, as for `parsed`, without options that a batch sets."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """One job on one recording; name: RECORDING/JOB.
+    """Job on one recording; name: RECORDING/JOB.
 
-    variant: matrix choices so far, by JOB.OPTION. words: the command line. inputs: files that decide the result.
-    needs: nodes before it. out: None for a command that only prints.
+    variant: matrix choices of this and earlier jobs, by JOB.OPTION. words: the command line. inputs: files that
+    decide the result. needs: nodes to run first. out: None for a command that only prints.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Node:
 
 
 def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
-    """All nodes, by recording, each after those it needs.
+    """All nodes, by recording, each after the nodes it needs.
 
     Raises UsageError for a cycle, an unknown placeholder or option.
     """
@@ -87,14 +87,14 @@ def select_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
 
 
 def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[str]:
-    """Distinct columns of a table of (job, column), in the order of the jobs."""
+    """Distinct columns of (job, column) pairs, in the order of `jobs`."""
     job_of = {name: job for job, name in columns}
     return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 
 
 def _add_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     set_options = {*job.options, *job.matrix}
-    set_options |= {"field", "lockstep"} & set_options and {"scene"}  # either stands for its scene
+    set_options |= {"field", "lockstep"} & set_options and {"scene"}  # with either, no scene is needed
     roles = {option: role for option, role in ROLES[job.command].items() if option not in set_options}
     if job.command in {"reconstruct", "score"} and "dtu" in set_options:
         roles = {option: role for option, role in roles.items() if option == "scene"}
@@ -262,7 +262,7 @@ def _join(variants: Sequence[Variant]) -> Variant | None:
 
 
 def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Add matrix choices; ``set.SECTION.KEY`` and ``perturb.NAME`` add to a table."""
+    """Add matrix choices to options; ``set.SECTION.KEY`` and ``perturb.NAME`` add to their table."""
     merged = dict(options)
     for key, value in chosen.items():
         table, dot, entry = key.partition(".")
@@ -275,7 +275,7 @@ def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
 
 
 def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
-    """Fill each {place}; a text that is one place may become a list."""
+    """Fill each {place}; a text of only one place may become a list."""
     if isinstance(value, str):
         if alone := _PLACE.fullmatch(value):
             return filled(alone[1])

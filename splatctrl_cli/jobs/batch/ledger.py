@@ -37,7 +37,7 @@ _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One ended run of a node; `state` is done (as expected), failed, error or skipped."""
+    """Ended run of a node; `state` is done (as expected), failed, error or skipped."""
 
     node: str
     recording: str = ""
@@ -92,7 +92,7 @@ CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, stamp TEXT, digest TE
 
 
 class Ledger(AbstractContextManager["Ledger"]):
-    """The ledger of batches in one folder; several processes may open it."""
+    """Ledger of batches in one folder; several processes may open it."""
 
     def __init__(self, folder: Path) -> None:
         """Open the ledger. Raises InputError for another kind of file, or a newer ledger."""
@@ -134,7 +134,7 @@ class Ledger(AbstractContextManager["Ledger"]):
         self._base.close()
 
     def claim(self, node: str) -> bool:
-        """Claim a node for this process; False if another live one has it."""
+        """Claim a node for this process; False if another live process has it."""
         with self._transaction():
             row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
             if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
@@ -168,7 +168,10 @@ class Ledger(AbstractContextManager["Ledger"]):
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
-        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10". Raises UsageError for others."""
+        """Runs that meet conditions like "job=audit", "node=a/*", "seconds>10".
+
+        Raises UsageError for an invalid condition.
+        """
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], list[Any]()
         for condition in conditions:
             match = re.fullmatch(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)", condition.strip())
@@ -237,7 +240,7 @@ def run_of_document(plain: Mapping[str, Any]) -> Run:
 
 
 def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]:
-    """Key of each node, in order of need. Raises InputError for a missing input."""
+    """Key of each node; needed nodes come first. Raises InputError for a missing input."""
     code, digests = code_version(), dict[Path, str]()
     keys: dict[str, str] = {}
     outs = {node.name: str(node.out) for node in nodes}
@@ -254,7 +257,7 @@ def keys_of(nodes: Sequence[Node], ledger: Ledger, entry: str) -> dict[str, str]
 
 @cache
 def code_version() -> str:
-    """Digest of the package's files and the versions that decide figures."""
+    """Digest of the package's files, and of package versions that decide figures."""
     folder, sha = Path(splatctrl_cli.__file__).parent, hashlib.sha256()
     for place in sorted(place for place in folder.rglob("*") if place.suffix in {".py", ".so", ".toml", ".json"}):
         sha.update(f"{place.relative_to(folder)}\0".encode() + place.read_bytes())
@@ -273,7 +276,7 @@ def _deciding_words(words: Sequence[str], named: Mapping[str, str]) -> list[str]
 
 
 def _digest(path: Path, ledger: Ledger) -> str:
-    """Digest of an input and what it names: images, a URDF's meshes."""
+    """Digest of an input and the files that it names: images, a URDF's meshes."""
     with refuse_faults(
         lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy="check the suite's paths"
     ):

@@ -1,4 +1,4 @@
-"""The scheduler of a batch: nodes run in processes, in graph order; unchanged results stay."""
+"""Scheduler of a batch: nodes run in processes, in graph order; unchanged results stay."""
 
 import json
 import os
@@ -22,15 +22,15 @@ from splatctrl_cli.jobs.running.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 DISK_FULL = 6  # exit code
-AGAIN_S = 0.5  # between looks at what another batch runs
-STILL_S = 60.0  # without an ended node, until a log line names what runs
-MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
+AGAIN_S = 0.5  # between looks at nodes that another batch runs
+STILL_S = 60.0  # without an ended node, until a log line names a running node
+MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes that this batch did not ask for
 PRINTED = "printed"  # stamp of a node that only prints
 
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """A runner of nodes on `slots` places; hint: why a wait may be in vain."""
+    """Runner of `slots` nodes at once; hint: why a wait may be in vain."""
 
     ledger: Ledger
     entry: str
@@ -44,7 +44,7 @@ class Scheduler:
     num_kept: int = 0
 
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
-        """The run of each node by name, kept or new."""
+        """Run the nodes; return each node's run by name, kept or new."""
         self.keys = keys_of(nodes, self.ledger, self.entry)
         latest = self.ledger.latest()
         waiting = {node.name: node for node in nodes}
@@ -82,7 +82,7 @@ class Scheduler:
         latest: Mapping[str, Run],
         clock: "Clock",
     ) -> bool:
-        """Settle kept nodes and submit due ones; True if another batch runs one."""
+        """Settle nodes with kept runs, submit due nodes; True if another batch runs one."""
         is_busy = False
         for node in list(waiting.values()):
             if len(futures) >= self.slots:
@@ -117,7 +117,7 @@ class Scheduler:
         return is_busy
 
     def _reuse_run(self, node: Node, before: Run | None) -> Run | None:
-        """The earlier or skipped run that stands for a node; None if it must run."""
+        """Earlier or skipped run of a node; None if the node must run."""
         key, folder = self.keys[node.name], self.ledger.folder
         if missing := [need for need in node.needs if not self.runs[need].stamp]:
             run = not_run(node, key, folder, state=SKIPPED, cause=f"needs {missing[0]}, which left nothing")
@@ -223,7 +223,7 @@ def local_executor(workers: int) -> Iterator[Executor]:
 
 
 class Clock:
-    """Count of finished nodes, and the time left by the mean of each job."""
+    """Count of finished nodes, and time left by each job's mean time."""
 
     def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
         self.started = time.time()
@@ -240,7 +240,7 @@ class Clock:
         return f"[{self._total - self._left.total()}/{self._total}]"
 
     def left(self) -> str:
-        """The time left in words; "over" a time if a job has no mean yet."""
+        """Time left in words, with "over" if a job has no mean time yet."""
         means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
         known = Counter({job: count for job, count in self._left.items() if count and job in means})
         if not known:

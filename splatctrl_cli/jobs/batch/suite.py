@@ -27,10 +27,10 @@ EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One command of a suite.
+    """Command of a suite.
 
-    options: by long name. matrix: values by option; each combination is a variant.
-    expect: a verdict's label or outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
+    options: by long name. matrix: values by option; each combination is a variant. expect: a verdict's label or
+    outcome, or "exit N". timeout [s], memory [bytes]: 0 for no limit.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One recording of one file, or several of a session.
+    """One recording: one file, or several files of a session.
 
-    only: its jobs, empty for all. overrides: options by job.
+    only: names of its jobs, empty for all. overrides: options by job.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """A suite's file; its paths are relative to `folder`."""
+    """Suite's file; its paths are relative to `folder`."""
 
     name: str
     folder: Path
@@ -68,7 +68,7 @@ class Suite:
 
 
 def read_suite(path: Path, commands: Sequence[str]) -> Suite:
-    """Read a suite; commands: allowed ones. Raises InputError, or UsageError for its content."""
+    """Read a suite of allowed `commands`. Raises InputError if unreadable, UsageError if invalid."""
     example = "see splatctrl help batch for an example"
     refuse_if(path.is_dir(), f"{path}: is a folder", remedy="give the suite's file, or --list with it")
     with (
@@ -98,7 +98,7 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
 
 
 def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str]) -> list[Job]:
-    """Jobs of a recording with its overrides. Raises UsageError for an invalid one."""
+    """Jobs of a recording with its overrides. Raises UsageError for an invalid override."""
     chosen = [job for job in jobs if job.name in recording.only or not recording.only]
     own = [_job(job.name, recording.overrides.get(job.name, {}), commands, job) for job in chosen]
     return [

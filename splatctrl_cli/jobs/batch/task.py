@@ -1,7 +1,7 @@
 """One node's run in a forked child under limits, with log, result and end.
 
-A runner has imported the commands, so a node costs a fork. It runs one node at a time, a line of JSON from stdin, and
-ends with stdin.
+A runner process has imported the commands, so a node costs only a fork. It reads a node per line of JSON from stdin,
+runs one at a time, and exits when stdin ends.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from splatctrl_cli.kernels.cuda.memory import num_cards
 
 Entry = Callable[[list[str]], int]
 
-PART = ".part"  # ends the name of a result that is not whole
+PART = ".part"  # suffix of an incomplete result
 _LAST = 4096  # bytes of a log searched for its last lines
 _local = threading.local()  # each thread's runner
 _runners: list["subprocess.Popen[str]"] = []
@@ -40,7 +40,7 @@ BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # reported by the batc
 class Task:
     """Work of a runner: call `entry` with `words`, write `result` (stdout), `log` (stderr), `end`.
 
-    key: the node's, kept in `end`. timeout [s], memory [bytes]: 0 for no limit.
+    key: the node's key, stored in `end`. timeout [s], memory [bytes]: 0 for no limit.
     """
 
     entry: str
@@ -56,9 +56,9 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """The end of a run. exit_code: None if `cause` killed or prevented it.
+    """End of a run. exit_code: None if `cause` killed or prevented the run.
 
-    started [s since 1970]. stamp: of the output, changes when rewritten.
+    started: [s since 1970]. stamp: changes when the output is rewritten.
     """
 
     key: str
@@ -71,7 +71,7 @@ class End:
 
 
 def run_task(task: Task) -> End:
-    """Run a task in this thread's runner, unless it already ended.
+    """Run a task in this thread's runner, unless the task already ended.
 
     A killed runner is started once more, but not after `stop_runners`.
     """
@@ -260,7 +260,7 @@ def _wait(pid: int, task: Task) -> str:
 
 
 def _signal(pid: int, number: signal.Signals) -> None:
-    """Signal a child's group, or the child before it has one."""
+    """Signal a child's process group, or the child before it has one."""
     try:
         os.killpg(pid, number)
     except ProcessLookupError:

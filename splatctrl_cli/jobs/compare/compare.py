@@ -38,9 +38,9 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRequest:
-    """Compare two folders, the earlier first, or one with the baseline `against`.
+    """Comparison of two folders, the earlier first, or one with the baseline `against`.
 
-    update_baseline: file for the last of `runs`, which may then be the only one.
+    update_baseline: file to write from the last, or only, one of `runs`.
     """
 
     runs: tuple[Path, ...]
@@ -50,9 +50,9 @@ class CompareRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class FigureChange:
-    """One figure of one run; `after` is None if it lost its value.
+    """Figure of one run; `after` is None if the figure lost its value.
 
-    allowed: tolerance, in `unit`. share: tolerances by which it is worse. where: worst state of a replay.
+    allowed: tolerance, in `unit`. share: harm in tolerances. where: worst state of a replay.
     """
 
     run: str
@@ -80,7 +80,7 @@ class FigureChange:
 
 @dataclass(frozen=True, kw_only=True)
 class JobChange:
-    """One figure of a job over the recordings: mean harm, and the worst recording."""
+    """Figure of a job over the recordings: mean harm, and the worst recording."""
 
     job: str
     metric: str
@@ -93,8 +93,9 @@ class JobChange:
 class CompareResult(JudgedResult):
     """Changes of figures, verdicts and jobs, regressions first.
 
-    verdicts: run, recording, change, and labels before and after. jobs: over enough recordings, which decide in place
-    of figures. differences: settings, versions and inputs, before and after. only_before: not compared.
+    verdicts: run, recording, change, and labels before and after. jobs: changes over enough recordings, which decide
+    in place of single figures. differences: settings, versions and inputs, before and after. only_before, only_after:
+    runs not compared.
     """
 
     verdicts: tuple[Mapping[str, str], ...]
@@ -132,7 +133,7 @@ class CompareResult(JudgedResult):
 def compare(request: CompareRequest, progress: Progress = SILENT) -> CompareResult:
     """Compare, and write a requested baseline.
 
-    Raises UsageError for another request, InputError for unreadable or unlike runs.
+    Raises UsageError for a wrong number of runs, InputError for unreadable or unlike runs.
     """
     num_needed = 1 if request.against is not None else 2
     refuse_if(
@@ -286,7 +287,7 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
 
 
 def _job_changes(figure_changes: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures over enough recordings, worse or better by interval and mean."""
+    """Changes of figures over enough recordings, judged by mean and confidence interval."""
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in figure_changes:
         if one.better is not Better.NEITHER and one.after is not None:
@@ -326,7 +327,7 @@ def _verdict_reasons(verdicts: Sequence[Mapping[str, str]], after: JudgedRuns) -
 
 
 def _regressions(figures: Sequence[FigureChange], jobs: Sequence[JobChange], kind: str) -> Iterator[Reason]:
-    """Reasons for what got worse, the most first; a note on single recordings."""
+    """Reasons for figures that got worse, the largest harm first; a note on single recordings."""
     weighed = [
         *((-one.share, one.metric, _figure_reason(one, kind)) for one in figures),
         *((-one.worst.share, one.metric, _job_reason(one)) for one in jobs if one.change is Change.WORSE),

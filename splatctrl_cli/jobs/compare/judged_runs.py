@@ -57,8 +57,8 @@ ANEW = "write it anew with --update-baseline"
 class JudgedRun:
     """One run with its verdict, figures and output folder.
 
-    name: unique in its batch. job: equal for like runs of other recordings. outcome: empty without a verdict.
-    is_green: ended as expected. settings: configuration, versions, inputs.
+    name: unique in its batch. job: equal for the same job on other recordings. outcome: empty without a verdict.
+    is_green: the run ended as expected. settings: configuration, versions, inputs.
     """
 
     name: str
@@ -76,7 +76,7 @@ class JudgedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedRuns:
-    """Runs to compare, by name; kind: "run" (a single one) or "batch"."""
+    """Runs to compare, by name; kind: "run" or "batch"."""
 
     path: Path
     kind: str
@@ -85,7 +85,7 @@ class JudgedRuns:
 
 
 def read_judged(path: Path) -> JudgedRuns:
-    """Read the folder of a judging command, audit or batch. Raises InputError for others."""
+    """Read the folder of a judging command, audit or batch. Raises InputError for other folders."""
     has_batch, has_run = is_batch(path), (path / "run.json").is_file()
     is_begun = not has_batch and not has_run and path.with_name(path.name + PARTIAL).exists()
     refuse_if(
@@ -179,7 +179,7 @@ def _settings(document: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
 
 
 def read_baseline(path: Path) -> JudgedRuns:
-    """Read a baseline. Raises InputError for another or newer file, or unknown figures."""
+    """Read a baseline. Raises InputError for another format or version, or unknown figures."""
     make = "make one with --update-baseline"
     with (
         refuse_faults(lambda error: f"{path}: cannot be read: {error.strerror}", OSError, remedy=make),
@@ -219,9 +219,9 @@ def read_baseline(path: Path) -> JudgedRuns:
 
 
 def write_baseline(path: Path, judged: JudgedRuns) -> None:
-    """Write the figures that have a direction, sorted, one a line.
+    """Write the figures that can be better or worse, sorted, one per line.
 
-    Raises UsageError if `path` is another file.
+    Raises UsageError if `path` exists and is no baseline.
     """
     refuse_if(
         path.exists() and (not path.is_file() or BASELINE.encode() not in path.read_bytes()[:200]),
@@ -258,7 +258,7 @@ def _toml(value: object) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class WorstState:
-    """A state by row (from 0) and time [s] in ``steps.csv``."""
+    """State by row (from 0) and time [s] in ``steps.csv``."""
 
     state: int
     time_s: float
@@ -271,7 +271,7 @@ class WorstState:
 
 
 def worst_state(folder: Path | None, metric: str) -> WorstState | None:
-    """Worst state of a replay by a metric; None if no state shows it."""
+    """Replay's worst state by a metric; None if no state shows the metric."""
     where = shown().get(metric)
     if where is None or folder is None or not (folder / "steps.csv").is_file():
         return None

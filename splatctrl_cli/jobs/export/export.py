@@ -1,6 +1,6 @@
 """An export: splats in a viewer's format, or a run as Foxglove MCAP.
 
-Written splats are read back and rendered before they count.
+Written splats are read back and rendered before the file is kept.
 """
 
 import math
@@ -60,10 +60,10 @@ Splats = SplatSet | GaussianSet
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """One export of a scene or splat file; the suffix of `out` is the format.
+    """Export of a scene or splat file; the suffix of `out` is the format.
 
     out: None for a PLY next to the scene. labels: None for all. layout: of a PLY, "short" or "full", None for the
-    lossless one. isotropic: make anisotropic Gaussians round.
+    lossless layout. isotropic: make anisotropic Gaussians round.
     """
 
     scene: Path
@@ -77,10 +77,10 @@ class ExportRequest:
 def export(request: ExportRequest, progress: Progress = SILENT) -> Result:
     """Write the splats, read them back and compare.
 
-    Metrics: origin: subtracted from every centre [m], in words. not_kept: attributes the format lacks. num_outside:
-    Gaussians clamped to the range. differences; allowed: the format's rounding. Over all views:
-    largest_pixel_difference in colour, opacity, or depth over scene size; psnr [dB], None if equal; covered_share.
-    isotropic_psnr [dB]: of the rounded splats.
+    Metrics: origin [m]: subtracted from every centre, in words. not_kept: attributes that the format lacks.
+    num_outside: splats clamped to the format's range. differences: largest found; allowed: largest by the format's
+    rounding. Over all views: largest_pixel_difference in colour, opacity, or depth per scene size; psnr [dB], None if
+    equal; covered_share of the pixels. isotropic_psnr [dB]: of round splats against the source.
 
     Raises UsageError, InputError or NotEvaluableError for unsuitable splats. Raises WriteError, leaving no file, for
     errors above the format's rounding.
@@ -179,7 +179,7 @@ def _format(out: Path, layout: str | None) -> SplatFormat:
 
 
 def _check_colors(source: Path, splats: Splats) -> None:
-    """Raise InputError for a colour so large that float32 loses others."""
+    """Raise InputError for a colour so large that float32 loses other colours."""
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
     refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
@@ -259,7 +259,7 @@ def _look(a: Splats, b: Splats) -> tuple[float, float | None, float]:
 
 
 def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
-    """Cameras around most splats, and their diagonal [m]."""
+    """Cameras around most splats, and the diagonal [m] of these splats."""
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = 320, 240
@@ -277,13 +277,13 @@ Later = tuple[int, int, Callable[[FoxgloveLog], None]]  # stamp [ns], order with
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRunRequest(FolderRequest):
-    """One export of a replay, scene or field folder to MCAP; out: None for PATH.mcap."""
+    """Export of a replay, scene or field folder to MCAP; out: None for PATH.mcap."""
 
 
 def export_run(request: ExportRunRequest) -> Result:
     """Write the MCAP; metrics: bytes, messages by topic.
 
-    Raises InputError for another folder, UsageError for a missing library.
+    Raises InputError for another kind of folder, UsageError for a missing library.
     """
     parts = sorted(_parts(open_run(request.path), request.roots), key=lambda part: part[:2])
     out = request.out or sibling_path(request.path.absolute(), ".mcap")

@@ -43,12 +43,12 @@ _DECIMALS = 7  # of a length [m]: finer than float32
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Answers at Q points, world; None if unavailable, NaN or -1 without one.
+    """Answers at Q points, world; None if unavailable, NaN or -1 without an answer.
 
     in_box (Q,): in the source's box. distance (Q,) [m], gradient (Q, 3). bound (Q,) [m]: lower bound of the exact
-    distance to the splats. probability (Q,) of collision. label (Q,) `Label` and splat (Q,), file index, of the
-    nearest sphere. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching, where the field reads rest
-    (Q,) [m].
+    distance to the splats. probability (Q,) of collision. label (Q,): `Label` of the nearest sphere; splat (Q,): its
+    file index. observed (Q,) `VoxelState`. surface (Q, 3) [m]: end of sphere marching; rest (Q,) [m]: the field's
+    value there.
     """
 
     in_box: Bool | None = None
@@ -66,10 +66,11 @@ class Answers:
 def scene_answers(
     source: BakeSource, obstacles: ObstacleSpheres, config: Config, threads: int, device: Memory | None = None
 ) -> Callable[..., Answers]:
-    """Answers of a scene's splats, and balls around unrepresented voxels, as a field by `config`.
+    """Return a function that answers from splats and balls around unrepresented voxels.
 
-    The function takes points (Q, 3) [m], world. It completes a grid's answers if they are given, with the probability
-    at the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved space.
+    It queries the field of `config` at points (Q, 3) [m], world. Given a grid's answers, it completes them, with the
+    probability at the grid's distance. Raises UsageError unless `field.unknown` is free: only a grid knows unobserved
+    space.
     """
     refuse_if(
         config.field.unknown != "free",
@@ -127,10 +128,10 @@ def scene_answers(
 
 
 def grid_answers(grid: DistanceGrid, where: str) -> tuple[Box, Callable[[Float64], Answers]]:
-    """Box of a baked grid's cell centres, and its answers at points (Q, 3) [m], world, none outside.
+    """Box of a baked grid's cell centres, and a function that answers points (Q, 3) [m], world.
 
-    Distances are interpolated, labels and observations of the nearest cell. Raises InputError as `GridField` does,
-    and for unknown labels or states.
+    Points outside have no answer. Distances are interpolated, labels and observations those of the nearest cell.
+    Raises InputError for a grid unfit for `GridField`, and unknown labels or states.
     """
     field, has_bound = GridField(grid), "bound" in grid.channels
     of_probability = GridField(grid, "probability") if "probability" in grid.channels else None
@@ -167,7 +168,8 @@ def grid_answers(grid: DistanceGrid, where: str) -> tuple[Box, Callable[[Float64
 def rows_of(points: Float64, answers: Answers) -> str:
     """CSV lines with a cell for each of `TITLES`, empty where unknown."""
     length, a = f"%.{_DECIMALS}f", answers
-    bound = None if a.bound is None else np.floor(a.bound * 10**_DECIMALS) / 10**_DECIMALS  # in print a bound still
+    # rounded down, it is still a bound
+    bound = None if a.bound is None else np.floor(a.bound * 10**_DECIMALS) / 10**_DECIMALS
     columns: list[tuple[str, NDArray[np.generic] | None]] = [
         *(("%.9g", points[:, axis]) for axis in range(3)),
         ("%d", a.in_box),
@@ -197,11 +199,11 @@ OF_GRID = {  # field settings: name and type in a grid's header
 
 @dataclass(frozen=True, kw_only=True)
 class QueryRequest(RunOptions):
-    """One table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
+    """Table of points for `source`: a field folder, ``field.npz``, scene folder or splat file.
 
-    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures alone. scene: the field's
-    source, for what the grid lacks. at: time after the scene's start [s], None for its end. labels: of splats that
-    count.
+    points: a CSV with columns x, y, z [m], world, or an open text. out: None for figures only. scene: the field's
+    source, for answers that the grid lacks. at: time after the scene's start [s], None for its end. labels: of splats
+    that count.
     """
 
     source: Path
@@ -213,11 +215,11 @@ class QueryRequest(RunOptions):
 
 
 def query(request: QueryRequest, progress: Progress = SILENT) -> Result:
-    """Answer the points, and write the answers to `out`.
+    """Answer the points, and write to `out`.
 
-    Metrics: num_points; num_answered, with a distance; num_outside the box; num_in_collision; num_never_seen;
-    min_distance, mean_distance, min_bound [m]; None if unknown. The document's source: scene, field, or field and
-    scene.
+    Metrics: num_points, num_answered (with a distance), num_outside (the box), num_in_collision, num_never_seen, and
+    min_distance, mean_distance, min_bound [m]. They are None if unknown. The document's source is scene, field, or
+    field and scene.
 
     Raises SplatCtrlError, leaving no file, for an unreadable source or table.
     """

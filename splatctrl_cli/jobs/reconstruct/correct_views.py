@@ -1,4 +1,4 @@
-"""Poses (``--refine-poses``) and exposure of a still scene's views, corrected by each other."""
+"""Correction of a still scene's poses (``--refine-poses``) and exposures between its views."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from splatctrl_cli.scene.scale import RecordedDepth
 class Corrections:
     """Requested corrections of a still scene's views.
 
-    Without a robot, exposure is also corrected unrequested, if brightness or colour differ as `check` names it.
+    Without a robot, exposure is corrected even unrequested, if `check` would report brightness or colour.
     """
 
     poses: bool = False
@@ -45,7 +45,7 @@ class Corrections:
         )
 
     def check(self, source: RecordSource) -> None:
-        """Raise UsageError for a recording over time."""
+        """Raise UsageError for corrections of a recording over time."""
         refuse_if(
             self and source.has_clock,
             f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
@@ -58,7 +58,8 @@ class Corrections:
     ) -> tuple[list[RgbdFrame], dict[str, Any]]:
         """Correct the frames; also return the facts for ``run.json``.
 
-        has_robot: depth stays as measured, since the map will judge. Raises InputError without depth.
+        has_robot: depth stays as measured, since the map will judge motion. Raises InputError if requested without
+        depth.
         """
         depth = RecordedDepth.of(frames)
         if not self and (source.has_clock or has_robot or depth is None):
@@ -85,7 +86,7 @@ def _correct_poses(
     recorded: list[RgbdFrame], scale: float, has_robot: bool, console: Progress
 ) -> tuple[list[RgbdFrame], dict[str, Any]]:
     refined, frames = refined_poses(recorded, scale), recorded
-    recorded_apart, apart = refined.before, refined.after  # of the depths as recorded
+    recorded_apart, apart = refined.before, refined.after  # [m], with depth as recorded
     bends = FoundBends() if has_robot else depth_bends(frames, refined, scale)
     if bends.grids:
         frames = freed(recorded, bends.grids)
@@ -140,7 +141,7 @@ def _describe(bends: FoundBends, scale: float, apart: float, after: float, conso
 
 
 def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_requested: bool) -> Float64 | None:
-    """Gains (N, 3), 1 if they differ by less than `EXPOSURE_GAIN`; None if neither requested nor found."""
+    """Gains (N, 3), all 1 if below `EXPOSURE_GAIN`; None if neither requested nor found."""
     gains = exposure_gains(frames, scale)
     least, most = float(gains.min()), float(gains.max())
     if is_requested and np.abs(np.log(gains)).max() < fixed.EXPOSURE_GAIN:
@@ -153,7 +154,7 @@ def _gains(frames: list[RgbdFrame], scale: float, console: Progress, *, is_reque
 
 
 def _are_exposures(gains: Float64, frames: Sequence[RgbdFrame], scale: float) -> bool:
-    """True if gains explain half of the differences of parts, unlike gloss and shadows."""
+    """True if gains differ, and explain half of the differences between image bands."""
     if (gains.max(axis=0) / gains.min(axis=0)).max() <= 1 + limits.EXPOSURE_RATIO:
         return False
     bands = band_ratios(frames, scale, np.ones(len(frames), np.bool_), limits.EXPOSURE_BANDS)
@@ -181,7 +182,7 @@ def corrected_among(
         return frame
     scale, free = depth.median / fixed.SCALE_DEPTH, np.arange(len(others) + 1) == 0
     respects = next(iter(corrections.values()))
-    # of the frame's camera, or of the only one with its intrinsics
+    # bend of the frame's camera, or of the only camera with its intrinsics
     cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
     camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
     bend = next((row.bend for (name, _), row in corrections.items() if name == camera), None)

@@ -1,4 +1,4 @@
-"""Time steps that leave a map: due ones, and those with a new obstacle."""
+"""Time steps that leave a map: due, or with a new obstacle."""
 
 from pathlib import Path
 
@@ -17,14 +17,14 @@ from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 
 class KeptMaps:
-    """Decisions on snapshots by written files alone, so a resumed run decides the same."""
+    """Decisions on snapshots from written files only, so a resumed run decides the same."""
 
     def __init__(self, writer: SceneWriter, config: Config) -> None:
         self._writer, self._config = writer, config
         self._last: tuple[Path, SphereField | None, OccupancyGrid] | None = None  # the last kept map
 
     def is_due(self, index: int, stamp_ns: int) -> bool:
-        """True every `snapshot_every` steps, but at most once in each multiple of `snapshot_period`."""
+        """True every `snapshot_every` steps, at most once per `snapshot_period` from the first snapshot."""
         scene, taken = self._config.scene, self._writer.snapshots
         if index % scene.snapshot_every:
             return False
@@ -37,7 +37,7 @@ class KeptMaps:
     def shows_news(self, fitter: SceneFitter) -> bool:
         """True if at least `NEWS_LEAST` spheres may be a new obstacle.
 
-        They stand out of the last kept map by over half a voxel, where it is free.
+        They reach more than half a voxel beyond the last map's spheres, from a free voxel of that map.
         """
         if not self._writer.snapshots:
             return False

@@ -130,7 +130,7 @@ def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[st
 def _learn_self(
     robot: RobotModel | None, request: ReconstructRequest, folder: Path, progress: Progress, *, is_new: bool
 ) -> tuple[RobotModel | None, dict[str, dict[str, Any]]]:
-    """Add the self-model, given, resumed or learned, to the robot; find `displaced_cameras`."""
+    """Add the given, resumed or learned self-model to the robot; find `displaced_cameras`."""
     if robot is None:
         return None, {}
     seen = arm_seen(robot, request.source, progress)
@@ -188,7 +188,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     except InputError as error:
         if any((request.urdf, request.spheres, request.self_model)):
             raise
-        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # nobody asked for it
+        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # not requested
         return None
     for doubt in model.doubts:
         progress.log(f"warning: {doubt}")
@@ -207,7 +207,7 @@ def _check_has_states(source: RecordSource) -> None:
 class LearnRequest(RobotOptions):
     """Learn the self-model of the robot `urdf` from `log` into `out`.
 
-    reach [m]: how far outside a link's visual surface parts are sought.
+    reach [m]: how far outside a link's visual surface to look for parts.
     """
 
     log: Path
@@ -240,9 +240,9 @@ def arm_of(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def arm_seen(model: RobotModel, source: RecordSource, progress: Progress) -> tuple[Arm, list[RgbdFrame]] | None:
-    """`arm_of` a log and its `frames_of`.
+    """Arm of a log, and frames to measure it by.
 
-    None without meshes, without a log that moves the robot, or (logged) without posed frames.
+    None without meshes, a log of joints, or (with a log line) posed frames.
     """
     if not isinstance(source, LOGGED) or not source.joint_names or not model.surface.trees:
         return None
@@ -261,7 +261,7 @@ def learn_from(arm: Arm, frames: Sequence[RgbdFrame], name: str, reach: float = 
 
 
 def frames_of(arm: Arm, source: FrameSource, progress: Progress = SILENT) -> list[RgbdFrame]:
-    """Frames of the moments with the most motion between them, by stamp.
+    """Frames at the moments with the largest motion between them.
 
     Raises InputError if no frame is posed.
     """

@@ -1,4 +1,4 @@
-"""The fitter over a source's time steps, with outputs and checkpoints."""
+"""Fitter over a source's time steps, with outputs and checkpoints."""
 
 import math
 import time
@@ -52,11 +52,11 @@ def training_cameras(source: RecordSource) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructRequest(RobotOptions, RunOptions):
-    """One reconstruction of `source` into the folder `out`.
+    """Reconstruction of `source` into the folder `out`.
 
-    urdf: the robot, segmented from the splats (None: the log `recording`'s); its reach is the workspace
-    without `box`. points: a coloured cloud to start from. declare: a TOML of carried objects. corrections: of a still
-    scene's views. options: the rest that decides the bytes, which a resumed run must share.
+    urdf: the robot to segment from the splats (None: that of the log `recording`). Without `box`, its reach is the
+    workspace. points: a coloured cloud to start from. declare: a TOML of carried objects. corrections: of a still
+    scene's views. options: other options that decide the bytes, equal in a resumed run.
     """
 
     source: RecordSource
@@ -78,8 +78,8 @@ class ReconstructRequest(RobotOptions, RunOptions):
 class Reconstruction:
     """One run of a request into `folder`, continued from `checkpoint` if given.
 
-    identity: plain values a continued run must share. observe: called with every frame of the source. cameras_off:
-    `displaced_cameras`, placed as corrected.
+    identity: plain values, equal in a continued run. observe: called with every frame of the source. cameras_off:
+    `displaced_cameras`, whose poses are corrected.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Reconstruction:
         self.is_refined = False
         self.corrected: dict[str, Any] = {}  # corrections of the views
         self._early: TimeStep | None = None  # the first step without a workspace
-        self.depth: RecordedDepth | None = None  # that chose the map's lengths
+        self.depth: RecordedDepth | None = None  # depth that chose the map's lengths
         self.agreement = CameraAgreement(
             self.source,
             is_allowed=request.allow_disagreement,
@@ -130,7 +130,7 @@ class Reconstruction:
 
     @property
     def fitter(self) -> SceneFitter:
-        """The fitter, made from the first time step with a workspace."""
+        """Fitter, made from the first time step with a workspace."""
         assert self._fitter is not None
         return self._fitter
 
@@ -231,7 +231,7 @@ class Reconstruction:
         return fitter
 
     def _grow_budget(self, row: AuditRow, console: Progress) -> bool:
-        """Enlarge a default budget that the first step exceeded next to a robot."""
+        """Enlarge the default splat budget if the first step exceeded it next to a robot."""
         least = SceneConfig().max_splats
         if self.robot is None or not row.unmet or self.config.scene.max_splats != least:
             return False

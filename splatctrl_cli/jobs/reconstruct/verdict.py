@@ -1,4 +1,4 @@
-"""The verdict of a reconstruction."""
+"""Verdict of a reconstruction."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,12 +28,12 @@ GATED = {
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
 }  # figures --require can name, with their comparison scales
-LONGEST_BLIND = 1.0  # [s] as long as a replay takes what it knows for evidence
+LONGEST_BLIND = 1.0  # [s], the age up to which depth is evidence in a replay, by default
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstructed:
-    """Input of the criteria; is_seeded: from points, so depth was not used."""
+    """Input of the criteria; is_seeded: splats start from points, and depth was not used."""
 
     metrics: Mapping[str, Any]
     rows: Sequence[AuditRow]
@@ -149,7 +149,7 @@ def _blind(run: Reconstructed) -> Iterator[Reason]:
 
 
 def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
-    """First and last stamp [ns] of each camera's longest stretch without depth."""
+    """First and last stamp [ns] of each camera's longest time without depth."""
     since: dict[str, int] = {}
     longest: dict[str, tuple[int, int]] = {}
     for row in rows:

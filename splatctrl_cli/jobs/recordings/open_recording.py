@@ -25,11 +25,11 @@ from splatctrl_cli.scene.time_steps import TimeStep
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingRequest:
-    """A recording at `path`: log, capture, image folder, or DTU data set.
+    """Recording at `path`: log, capture, image folder, or DTU data set.
 
-    scan: None for the only one. options: for a scan its holdout alone. protocol: of views. masks, depths: folders for
-    a scan. downscale: None for the protocol's size. others: more logs of the session. Raises UsageError if `others`
-    is given with an image folder.
+    scan: None for the only one. options: a scan uses only `holdout`. protocol: names a split of the views. masks,
+    depths: folders for a scan. downscale: None for the protocol's size. others: more logs of the session. Raises
+    UsageError if `others` is given with an image folder.
     """
 
     path: Path
@@ -59,8 +59,8 @@ def open_to_train(
 ) -> RecordSource:
     """Open the recording without held-out views.
 
-    Raises UsageError for options of other recordings. Raises InputError for a scan without depth, a camera jump above
-    `max_pose_jump` [m], and `check`'s errors but `allowed`.
+    Raises UsageError for options of another kind of recording. Raises InputError for a scan without depth, a camera
+    jump above `max_pose_jump` [m], and errors of `check` not in `allowed`.
     """
     if recording.is_dtu:
         scan = open_dtu(recording)
@@ -97,7 +97,7 @@ def open_dtu(recording: RecordingRequest) -> DtuSource:
 def open_held_out(
     recording: RecordingRequest, *, needs_depth: bool = False
 ) -> tuple[FrameSource, ScoreProtocol, Split]:
-    """Open an image folder with the views of the protocol holdout:RULE held out, by position."""
+    """Open an image folder; protocol holdout:RULE holds views out by position."""
     name, path = recording.protocol or "", recording.path
     protocol = score_protocol(name)
     refuse_if(
@@ -120,7 +120,7 @@ def open_held_out(
 
 
 def is_folder_of_views(path: Path) -> bool:
-    """True for images in a folder, by a TOML or a dataset's layout."""
+    """True for an image folder, described by a TOML or a dataset's layout."""
     return path.suffix == ".toml" or (not is_capture(path) and has_views(path))
 
 
@@ -141,7 +141,7 @@ def refuse_scan_options(recording: RecordingRequest) -> None:
 
 
 def check_pose_jumps(source: FrameSource, limit: float) -> None:
-    """Raise InputError for a camera that jumps; views without times may lie anywhere."""
+    """Raise InputError for a camera jump above `limit` [m]; views without times may lie anywhere."""
     refuse_if(not limit > 0, f"--max-pose-jump: expected metres, got {limit}", error=UsageError)
     jump = largest_jump(source.poses()) if source.has_clock else None
     if jump is not None and jump.distance > limit:
@@ -155,7 +155,7 @@ def check_pose_jumps(source: FrameSource, limit: float) -> None:
 
 
 class CameraAgreement:
-    """Agreement of cameras; disagreement [m]: how far apart a pair sees surfaces.
+    """Agreement of cameras; disagreement: median difference [m] of depths, by pair.
 
     is_allowed: warn instead of refusing. is_still: views of a step show the same scene. guess: a guessed unit, in
     words.
@@ -167,9 +167,9 @@ class CameraAgreement:
         self._is_allowed, self._is_still, self._guess = is_allowed, is_still, guess
 
     def check(self, step: TimeStep, limits: OccupancyConfig, console: Progress) -> None:
-        """Compare each pair of cameras once, and in a still scene the depth scale.
+        """Compare each pair of cameras once; check a still scene's depth scale.
 
-        Raises InputError for surfaces too far apart, or views that fit at another depth scale only.
+        Raises InputError for surfaces too far apart, or views that fit only at another depth scale.
         """
         names = sorted(frame.camera for frame in step.frames)
         if {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)} <= self.disagreement.keys():

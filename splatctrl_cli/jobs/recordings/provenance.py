@@ -1,4 +1,4 @@
-"""Checks by content that scene or field, log, truth and robot belong together.
+"""Checks that the contents of scene or field, log, truth and robot belong together.
 
 Camera names are alike on every rig and prove nothing.
 """
@@ -40,7 +40,7 @@ def first_frame(frame: RgbdFrame) -> dict[str, Any]:
 def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]) -> list[str]:
     """Describe how `records` differ from a scene's first frames; empty if alike.
 
-    Reads until each frame was found or passed.
+    Reads until each first frame was found or passed.
     """
     wanted = {str(first["camera"]): first for first in recorded}
     last = max(int(first["stamp_ns"]) for first in recorded)
@@ -62,7 +62,7 @@ def differences(recorded: Sequence[Mapping[str, Any]], records: Iterator[Record]
 
 
 def changed_files(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Describe files of equal name but another digest; descriptions (.toml) may change."""
+    """Describe files with equal names but other digests; descriptions (.toml) may change."""
     common = [name for name in then if name in now and not name.endswith(".toml")]
     changed = [name for name in common if then[name] != now[name]]
     if len(common) == 1:
@@ -111,7 +111,7 @@ S = TypeVar("S", SceneConfig, OccupancyConfig)
 def scene_mismatches(
     scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
 ) -> Iterator[Reason]:
-    """Mismatches of a reconstruction with a log and robot: provenance, times, and its own parts."""
+    """Mismatches of a reconstruction with a log and robot: provenance, times, and splats against occupancy."""
     if scene.parts.digests is None:
         yield not_evaluable(
             sentence=f"{scene.path}: expected digests of its files, got none: an earlier version wrote it",
@@ -133,9 +133,9 @@ def scene_mismatches(
 def made_from_mismatches(
     path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
 ) -> Iterator[Reason]:
-    """Mismatches of a scene or field, by its `SceneFolder.made_from`, with a log and robot.
+    """Mismatches of a scene or field, described by `made_from`, with a log and robot.
 
-    Compares digests, training cameras' first frames, and the segmented robot; also finds corrected depth.
+    Compares digests, training cameras' first frames, and the segmented robot. Corrected depth is also a mismatch.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -176,7 +176,7 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Difference of a scene's robot from a model in words, or empty."""
+    """Difference of a scene's robot from a model in words, or empty text."""
     joints = made_from.get("robot_joints")
     if joints is None:
         return ""
@@ -200,7 +200,7 @@ def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Reason | None:
-    """Mismatch of stamps (T,) [ns] and a scene's span; None if they (nearly) overlap."""
+    """Mismatch of state stamps (T,) [ns] and a scene's span; None if they overlap, or almost."""
     first, last = int(states_ns[0]), int(states_ns[-1])
     apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
     if apart_ns <= fixed.RECORDINGS_APART_NS:
@@ -240,7 +240,7 @@ def _read_section(section: type[S], values: object) -> S:
 
 
 def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Reason | None:
-    """Mismatch of a truth file and logged states, by the truth's clearance."""
+    """Mismatch of a truth file and logged states, by stamps and clearances."""
     stamps = states.stamp_ns
     shared = np.intersect1d(truth.stamps, stamps)
     if not len(shared):

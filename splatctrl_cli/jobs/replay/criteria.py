@@ -1,4 +1,4 @@
-"""Input of a replay's criteria, thresholds as rows; criteria of the controller."""
+"""Input of a replay's criteria, thresholds as table rows, and criteria of the controller."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ SLOW = "log joint states more often"
 
 @dataclass(frozen=True, kw_only=True)
 class Judged:
-    """The input of a replay's criteria."""
+    """Input of a replay's criteria."""
 
     request: ReplayRequest
     inputs: ReplayInputs
@@ -33,7 +33,7 @@ class Judged:
 
     @property
     def threshold(self) -> float:
-        """The margin [m] less solver and rounding error."""
+        """Margin [m] less solver and rounding error."""
         return self.replay.margin - SLIGHTLY_UNDER
 
     @property
@@ -53,9 +53,9 @@ def mm(metres: float) -> str:
 def worst_state(
     trace: Trace, values: Float64, pick: Callable[[Float64], np.intp] = np.nanargmin, who: Sequence[str] = ()
 ) -> Reason | None:
-    """The value of (T,) that `pick` takes, as a reason without a sentence; None without values.
+    """Value that `pick` chooses, as a reason without a sentence; None without values.
 
-    who (T,): names.
+    values: (T,). who: names (T,).
     """
     count = int(np.sum(~np.isnan(values)))
     if not count:
@@ -66,7 +66,7 @@ def worst_state(
 
 
 def largest_about(trace: Trace, column: str) -> float | None:
-    """The largest value about the arm; None if the space about it was not evaluated."""
+    """Largest value about the arm; None if that space was not evaluated."""
     largest = worst_state(trace, trace[column], np.nanargmax)
     return None if largest is None else largest.value
 
@@ -76,11 +76,12 @@ Number = float | Callable[[Judged], float]
 
 @dataclass(frozen=True, kw_only=True)
 class Bound:
-    """A threshold as a row of a table; the worst value of a quantity decides.
+    """Threshold as a row of a table; the worst value of a quantity decides.
 
-    on: a column (T,) of the trace, of (T, K) the least of `parts`; or a function of the worst value. who: column of
-    names. at_most, at_least: the allowed value, or where the input has it, and its `tolerance`. above: to be exceeded
-    (0: the margin). say, passed: sentences, without `passed` no passed reason. quantity, why: for the documentation.
+    on: a column (T,) of the trace, (T, K) for the least of `parts`, or a function that returns the worst value. who:
+    column of names. at_most, at_least: the allowed value, or a function of the input; `tolerance` widens it. above:
+    without either, the value must exceed this (0: the margin). say, passed: sentences; without `passed`, a pass gives
+    no reason. quantity, why: for the documentation.
     """
 
     on: str | Callable[[Judged], Reason | None]
@@ -135,12 +136,12 @@ class Bound:
         return values <= allowed if self.at_least is None else values < allowed - tolerance
 
     def is_broken(self, trace: Trace, margin: float) -> bool:
-        """True if a state breaks a limit about the arm; margin [m]."""
+        """True if a state breaks this limit about the arm; margin [m]."""
         allowed = self.at_most if isinstance(self.at_most, float) else self.above or margin
         return bool(np.any(self.breaks(self.values(trace), allowed)))
 
     def values(self, trace: Trace) -> Float64:
-        """The column (T,); NaN where space about the arm was not evaluated."""
+        """Column (T,); NaN where space about the arm was not evaluated."""
         values: Float64 = trace[str(self.on)]
         return values[:, self.parts].min(axis=1) if self.parts else values
 
@@ -156,7 +157,7 @@ class Bound:
         return f"{self.quantity} | {within} | {self.why}"
 
     def _worst_state(self, trace: Trace, least: float) -> Reason | None:
-        """Add to `above` the place and the number of broken states."""
+        """Worst state; with `above`, also its place and the number of broken states."""
         values, pick = self.values(trace), np.nanargmin if self.at_most is None else np.nanargmax
         worst = worst_state(trace, values, pick, trace[self.who] if self.who else ())
         if worst is None or (self.at_most, self.at_least) != (None, None):
@@ -244,7 +245,7 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def _commanded(judged: Judged) -> Reason | None:
-    """The largest velocity commanded, as a share of its limit."""
+    """Largest velocity commanded, as a share of its limit."""
     replay = judged.replay
     if replay.outside is None:
         return None

@@ -1,9 +1,9 @@
 """References of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
 
-The field's value at a surface point is the map's miss there. Let d be a sphere's true clearance, to surface point p.
-The exact distance is 1-Lipschitz: the map's clearance is at most d plus the miss at p. If no surface within
-`verdict.evidence_reach` of the motion is missed by more than b (`evaluate.conformal`), the true clearance is at least
-the map's less b, or more than that reach.
+The map's distance at a true surface point, where it should be 0, is called the miss. Let d be a sphere's true
+clearance, to surface point p. The exact distance is 1-Lipschitz: the map's clearance is at most d plus the miss at p.
+Let no miss within `verdict.evidence_reach` of the motion exceed b (`evaluate.conformal`). Then the true clearance is
+at least the map's clearance minus b, or exceeds that reach.
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,12 +37,12 @@ from splatctrl_cli.robot.sphere_files import sphere_names
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.simulate.truth import Truth, distance_to
 
-EVERY = "held_out_every"  # metric of a lockstep scene: its held-out frame sets
+EVERY = "held_out_every"  # metric of a lockstep scene: k if each k-th frame set is held out
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """A source of held-out frame sets: all of `cameras`, or with `every` k each k-th."""
+    """Source of held-out frame sets: all sets of `cameras`, or each `every`-th."""
 
     source: RecordSource
     cameras: tuple[str, ...]
@@ -115,7 +115,7 @@ def check_evidence(request: ReplayRequest) -> None:
 def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> SourceOptions:
     """Log options of a lockstep without the held-out camera.
 
-    Raises UsageError without another one.
+    Raises UsageError without another camera.
     """
     others = tuple(camera for camera in cameras if camera != request.evidence)
     refuse_if(
@@ -130,7 +130,7 @@ def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> Source
 def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
     """Open the log again with the held-out cameras; None without ``--evidence``.
 
-    Raises InputError if the log has no depth from them.
+    Raises InputError without depth from these cameras.
     """
     if request.evidence is None:
         return None
@@ -182,9 +182,9 @@ def misses_of(
 ) -> tuple[list[int], Float64, int]:
     """Largest miss of each held-out frame set near the motion, without the robot.
 
-    Returns stamps [ns] of T sets, their largest miss and its place (T, 4) [m], NaN without points, and the number of
-    points. Near is within `reach` [m]; sets count within the audited time. Each is compared with the map just before
-    it: the next one contains other cameras of that moment, and misses less.
+    Returns stamps [ns] of the T sets in the audited time, an array (T, 4) [m], and the number of points. Its columns
+    are the largest miss and the place, NaN without points. Near means within `reach` [m]. Each set is compared with
+    the map just before it: the next map contains other cameras of that moment, and misses less.
     """
     swept, cameras = Swept.of(inputs.model, trace, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(trace.stamp_ns[0]), int(trace.stamp_ns[-1])
@@ -220,7 +220,7 @@ def surface_points(frame: RgbdFrame) -> Float64:
 def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
     """Keep points (Q, 3) [m] that cannot be the robot at q (J,).
 
-    They are over ROBOT_MARGIN from its spheres and what these leave uncovered.
+    These are over ROBOT_MARGIN outside the robot's spheres, each enlarged by the surface it leaves uncovered.
     """
     if not len(points):
         return points
@@ -230,7 +230,7 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
 
 
 def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
-    """Largest distance [m] of points (Q, 3) to the map, and its point: (4,)."""
+    """Array (4,) [m]: largest distance of points (Q, 3) to the map, and its point."""
     if not len(points):
         return np.full(4, np.nan)
     values = distance(points)
@@ -239,10 +239,10 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Space within `reach` [m] of an arm's moving spheres, plus a cell's diagonal at most."""
+    """Space within `reach` [m] of an arm's moving spheres, larger by at most a cell's diagonal."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
-        """Enclose cells (K, 3), whole numbers of SPHERE_CELL, by radii (K,) [m], the largest in each."""
+        """Enclose cells (K, 3), counted in SPHERE_CELL; radii (K,) [m]: the largest in each cell."""
         centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
         enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
         self._field = SphereField(Spheres.of(centers, enlarged))
@@ -251,7 +251,7 @@ class Swept:
 
     @classmethod
     def of(cls, model: RobotModel, trace: Trace, reach: float) -> "Swept":
-        """Sweep every audited state; memory grows with the space passed alone."""
+        """Sweep every audited state; memory grows only with the swept space."""
         moving = np.flatnonzero(model.moving_spheres)
         cells, radii = np.zeros((0, 3)), np.zeros(0)
         for first, last in ranges(len(trace.rows("q"))):
@@ -265,13 +265,13 @@ class Swept:
         return cls(cells, radii, reach)
 
     def near(self, points: Float64) -> Float64:
-        """Keep the points (Q, 3) [m] inside the swept space."""
+        """Keep points (Q, 3) [m] inside the swept space."""
         inside = points[self._box.contains(points)]
         return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside
 
 
 class TrueSurfaces:
-    """True surface points (T, 3) [m] nearest to each state; `seen` (T,) by then."""
+    """True surface points (T, 3) [m] nearest to each state; `seen` (T,): seen by then."""
 
     def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
         self._points, self._stamp_ns = points, stamp_ns
@@ -311,7 +311,7 @@ def add_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurface
 
 
 def add_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
-    """Compare the audit with the truth near seen surfaces, after the last frame."""
+    """Compare the audit with the truth near seen surfaces; call after the last frame."""
     truth = replay.trace["clearance_true"]
     return replace(
         replay,

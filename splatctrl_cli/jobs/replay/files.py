@@ -131,7 +131,7 @@ def events_document(replay: Replay) -> dict[str, Any]:
 
 
 def when_and_why(replay: Replay) -> list[str]:
-    """The first intervention and the first event of each kind, with counts, as sentences."""
+    """First intervention and the first event of each kind, with counts, as sentences."""
     lines = []
     if replay.mode != "audit" and replay.outside is None:
         first = first_intervention(replay.events)
@@ -202,7 +202,7 @@ ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
 
 
 def draw_replay(folder: Path, replay: Replay) -> None:
-    """Write the pictures the mode has, over seconds since the first state."""
+    """Write the mode's pictures over time [s] since the first state."""
     trace, names = replay.trace, replay.model.joint_names
     seconds = (trace.stamp_ns - trace.stamp_ns[0]) * 1e-9
     curves: dict[str, FloatRows] = {name: trace.rows(f"clearance_{name}") for name in replay.fields}
@@ -243,7 +243,7 @@ def draw_replay(folder: Path, replay: Replay) -> None:
 def _intervals(
     replay: Replay, is_shown: Callable[[Event], bool], *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
-    """Spans [s] of shown events by kind and measure, with all of `at_least`."""
+    """Spans [s] of shown events by kind and measure, with an entry for each of `at_least`."""
     intervals: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):
@@ -254,9 +254,9 @@ def _intervals(
 
 
 def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterable[RgbdFrame]) -> list[Sight | None]:
-    """Images of the moments of least clearance, least first, by the truth if known.
+    """Images of the moments of least clearance (map or truth), least first.
 
-    None where no camera has one. Frames after the last moment are not read.
+    None for a moment without an image. Frames after the last moment are not read.
     """
     trace = replay.trace
     least = np.fmin(trace["clearance_exact"], trace.get("clearance_true", np.nan))

@@ -1,4 +1,4 @@
-"""The controller of a replay and its goal."""
+"""Controller of a replay and its goal."""
 
 import csv
 import re
@@ -70,7 +70,7 @@ def check_goal(request: ReplayRequest) -> None:
 def goal_waypoints(
     request: ReplayRequest, model: RobotModel, frame: str, logged_end: Float64
 ) -> tuple[Waypoint, ...]:
-    """The requested goals, at least one; by default the logged end pose."""
+    """Requested goals, at least one; by default the logged end pose."""
     if request.goal is not None:
         return (Waypoint(T_world_goal=transform_from(request.goal[:3], request.goal[3:])),)
     if request.goal_joints is not None:
@@ -82,7 +82,7 @@ def goal_waypoints(
 
 
 def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64:
-    """Configuration (J,) of --goal-joints; omitted fingers as logged at the end."""
+    """Configuration (J,) from --goal-joints; omitted fingers keep their last logged values."""
     is_arm = [name not in model.urdf.grippers for name in model.joint_names]
     if len(values) == sum(is_arm):
         posture = logged_end.copy()
@@ -94,8 +94,8 @@ def _posture(model: RobotModel, values: Float64, logged_end: Float64) -> Float64
 def read_waypoints(path: Path, model: RobotModel, frame: str) -> tuple[Waypoint, ...]:
     """Read poses or postures from a file.
 
-    Columns or keys: x, y, z, qx, qy, qz, qw, or one per joint name. CSV has a header; TOML tables ``[[waypoint]]``
-    with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
+    A row has x, y, z, qx, qy, qz, qw, or a value per joint. Rows are those of a CSV with a header, or TOML tables
+    ``[[waypoint]]`` with ``pose = [...]`` or ``joints = [...]``. Raises InputError.
     """
     remedy = "give --waypoints a .toml or .csv file"
     with refuse_faults(f"{path}: cannot be read", OSError, UnicodeDecodeError, remedy=remedy):
@@ -163,7 +163,7 @@ def check_twists(request: ReplayRequest) -> None:
 
 
 def twist_track(request: ReplayRequest, model: RobotModel, states_ns: Stamps, console: Progress) -> TwistTrack | None:
-    """Read the twists of --twist-topic, None without it; states_ns (T,): of the joint states.
+    """Read the twists of --twist-topic, None without the option; states_ns: joint states' stamps (T,).
 
     Raises InputError for an unknown frame, or no overlap in time.
     """
@@ -197,9 +197,9 @@ def twist_figures(
     track: TwistTrack | None,
     trace: Trace,
 ) -> Mapping[str, float | None]:
-    """`TWIST_FIGURES` of a controller's T steps, by columns `q` and `v`; empty without twists.
+    """Values of `TWIST_FIGURES` over a controller's T steps; empty without twists.
 
-    Share of states with a valid twist, share of these capped, and errors [m/s, rad/s].
+    Shares of states with a valid twist, and of capped ones among them; errors [m/s, rad/s] by columns `q` and `v`.
     """
     if track is None:
         return {}
@@ -223,7 +223,7 @@ def twist_figures(
 
 
 def check_controller(request: ReplayRequest) -> None:
-    """Raise UsageError for a controller in an audit, an invalid one, or its options alone."""
+    """Raise UsageError for a controller in an audit, an invalid controller, or options without one."""
     if request.controller is None and request.controller_command is None:
         refuse_if(
             request.controller_twice or request.controller_step_limit != STEP_LIMIT,
@@ -255,7 +255,7 @@ def commander_of(
 ) -> Iterator[Commander]:
     """Start our controller or the user's, which ends with the block.
 
-    Raises InputError if it does not start.
+    Raises InputError if the controller does not start.
     """
     if request.controller is None and request.controller_command is None:
         yield OURS

@@ -14,15 +14,15 @@ from splatctrl_cli.records import Float64, Stamps
 STEP_NS = 100_000_000  # between looks after a motion
 
 ClearanceIn = Callable[[int, Stamps, Float64], Float64]
-"""In the scene known at a stamp, of states (T,), (T, J): their clearances (T,) [m], declared contact left out."""
+"""Function of a scene's stamp, stamps (T,), positions (T, J): clearances (T,) [m] without declared contact."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LaterDepth:
-    """A state that kept the margin in the map, but not by later depth.
+    """State with the margin in its own map, but not in later depth.
 
-    stamp_ns: of the state. clearance [m]: by the depth of `depth_ns`. since_ns: start of a stretch without depth
-    about the arm, or 0.
+    stamp_ns: of the state. clearance [m]: in the depth of `depth_ns`. since_ns: start of the time without depth about
+    the arm, or 0.
     """
 
     depth_ns: int
@@ -32,7 +32,7 @@ class LaterDepth:
 
 
 class NewerDepth:
-    """Comparison of states with depth of their time, and of the last with later."""
+    """Comparison of states with their own depth, and of the last state with later depth."""
 
     def __init__(self, scene: KnownScene, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._margin, self._clearance_in = scene, margin, clearance_in
@@ -41,7 +41,7 @@ class NewerDepth:
         self.later: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64, clearance: Float64) -> None:
-        """Add states (T,), (T, J) and their clearances (T,) [m] in the map known then."""
+        """Add stamps (T,), positions (T, J) and clearances (T,) [m] in the map of their time."""
         is_clear = clearance >= self._margin
         states = [(int(stamps[k]), positions[k].copy()) for k in np.flatnonzero(is_clear)]
         self._last = states[-1] if is_clear[-1] else None
@@ -50,7 +50,7 @@ class NewerDepth:
             self._hold(int(stamps[-1]))
 
     def finish(self) -> None:
-        """Compare the last states with their own depth and the next one."""
+        """Compare waiting states with their own depth, and the last state with the next depth."""
         if self._last is None or not self._scene.stamps_ns:
             return
         stamp_ns, q = self._last
@@ -81,7 +81,7 @@ class NewerDepth:
 
 
 class Hindsight:
-    """Comparison of postures since the last depth about the arm with a later map."""
+    """Comparison of a later map with postures since the last depth about the arm."""
 
     def __init__(self, scene: KnownScene, near: NearSpace, margin: float, clearance_in: ClearanceIn) -> None:
         self._scene, self._near, self._margin, self._clearance_in = scene, near, margin, clearance_in
@@ -91,14 +91,14 @@ class Hindsight:
         self.later: list[LaterDepth] = []
 
     def add(self, stamps: Stamps, positions: Float64) -> None:
-        """Add states (T,), (T, J) of the motion."""
+        """Add stamps (T,) and positions (T, J) of the motion."""
         for at, stamp in enumerate(stamps.tolist()):
             if not self._stamps or stamp >= self._stamps[-1] + UNWATCHED_APART_NS or at == len(stamps) - 1:
                 self._stamps.append(stamp)
                 self._postures.append(positions[at].copy())
 
     def looked(self, stamp_ns: int, age_s: float) -> None:
-        """Register the age of depth about the arm; NaN if unknown."""
+        """Register the age [s] of depth about the arm; NaN if unknown."""
         if not np.isfinite(age_s):
             return
         seen_ns = stamp_ns - round(age_s * 1e9)

@@ -53,7 +53,7 @@ LOG_FIGURES = {  # they describe the log
 
 
 def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[RobotModel, FrameSource | StateSource]:
-    """Open the log and its robot, with fingers locked that the log does not move.
+    """Open the log and its robot; fingers that the log does not move are locked.
 
     Raises InputError for a log without joint states, UsageError for an unknown robot.
     """
@@ -80,7 +80,7 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredRobot:
-    """A robot with measured coverage, link surfaces (None if unreadable), and lowered pair margins."""
+    """Robot with measured coverage, link surfaces (None if unreadable), and lowered pair margins."""
 
     model: RobotModel
     surfaces: SelfSurfaces | None
@@ -146,7 +146,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 
 
 def words_of(robot: MeasuredRobot, config: ControlConfig, by_surface: Sequence[str] = ()) -> dict[str, str]:
-    """Sentences on what the robot's spheres cover, by subject. by_surface: of `ReplayTrace`."""
+    """Sentences on what the robot's spheres cover, by subject. by_surface: that of `ReplayTrace`."""
     words = {"coverage": coverage_words(robot.model, config)}
     if own_margins := [pair for pair in robot.pair_margins if pair.margin is not None]:
         words["self_margins"] = _self_margin_words(robot, own_margins, config)
@@ -178,7 +178,7 @@ def _gap_words(pair: KeptMargin) -> str:
 
 
 def coverage_words(model: RobotModel, config: ControlConfig) -> str:
-    """The uncovered surface, or why it is unknown, and the resulting surface margin."""
+    """Uncovered surface, or why it is unknown, and the resulting surface margin."""
     report = model.coverage
     if report is None:
         return f"how much of the surface the spheres cover is not known: {model.coverage_unknown}"
@@ -215,9 +215,9 @@ def _proven(link: LinkCoverage) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedStates:
-    """States in the model's joint order, their source, and its checks.
+    """States in the model's joint order, their source, and checks.
 
-    poses: against forward kinematics, None if unlogged. clock: of cameras against the robot.
+    poses: logged poses against forward kinematics, None without any. clock: offset between cameras and robot.
     """
 
     source: RecordSource
@@ -263,9 +263,9 @@ class LoggedStates:
 
 
 def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:
-    """Read the robot's states; `clock_of` is known after the frames.
+    """Read the robot's states; their clock offset needs frames, too (`clock_of`).
 
-    Raises InputError if they cannot be the robot's.
+    Raises InputError if the states cannot be the robot's.
     """
     states = source.states.convert_joints(*model.joint_columns(source.joint_names))
     check_states(states, model.joint_names)
@@ -274,9 +274,10 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
 
 
 def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[DeclaredContact]:
-    """Contact of a hand's links with a grasped part where it is taken and left.
+    """Contact of a hand's links with a grasped part, where it is taken and left.
 
-    It lasts `GRASPING` longer: the map still shows the part there.
+    It may begin `GRASPING` before taking, and lasts `GRASPING` after taking and leaving: the map still shows the
+    part.
     """
     bodies = model.urdf.rigid_bodies(set(model.joint_names) - set(model.urdf.grippers))
     first_ns = int(states.stamp_ns[0])
@@ -295,7 +296,7 @@ def grasp_contacts(model: RobotModel, states: StateColumns) -> Iterator[Declared
 
 
 def recorded_postures(states: StateColumns) -> Float64:
-    """Postures (R, J) evenly over the log: SELF_POSTURES to twice as many, or all."""
+    """Every k-th posture (R, J) of the log: SELF_POSTURES to twice that number, or all."""
     return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
 
 

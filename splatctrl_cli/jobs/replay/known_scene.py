@@ -28,17 +28,17 @@ from splatctrl_cli.voxels import SWEPT, Balls, EvidenceClass, OccupancyGrid, See
 
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
-ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
+ROUNDING = 1e-5  # [m] subtracted from distances to splats, far above what float32 rounds within 8 m
 NUM_CACHED = 3  # scenes whose fields are kept: the last, this and the next
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownFields:
-    """The fields of one scene: `barrier` for a controller, `distances` for an audit.
+    """Fields of one scene: `barrier` for a controller, `distances` for an audit.
 
-    obstacles: points (Q, 3) [m], world -> the nearest of each. human: people alone. splats_alone: exact distance
-    without voxels that no splat represents. is_person (N,): labels of the exact distance's balls, None for a grid.
-    balls: of the barrier; None for a grid, or with a larger margin for people.
+    obstacles: function of points (Q, 3) [m], world, to each one's nearest obstacle. human: field of people only.
+    splats_alone: exact distance without voxels that no splat represents. is_person (N,): balls of the exact distance
+    that are people, None for a grid. balls: the barrier's balls; None for a grid, or if people have a larger margin.
     """
 
     barrier: DistanceField
@@ -53,12 +53,12 @@ class KnownFields:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownScene:
-    """The scene a replay may use at each time; unknown before `first_ns` (None: always known).
+    """Scene a replay may use at each time; unknown before `first_ns` (None: always known).
 
     `at(stamp_ns)` returns the same object while a scene is in use. observed, cameras: None if not recorded.
-    stamps_ns: of scenes, each known from `known_ns` on; empty for one scene for all times. `advance` makes the scenes
-    up to a stamp; call `finish` after the replay. box: of a grid's cell centres. moment_ns: of a baked field.
-    seen_at: when space was last seen, as known at a stamp; without has_seen_times, if it ever was.
+    stamps_ns: of scenes, each known from its `known_ns` on; empty if one scene serves all times. `advance` makes the
+    scenes up to a stamp; call `finish` after the replay. box: of a grid's cell centres. moment_ns: stamp of a baked
+    field. seen_at: when space was last seen, as known at a stamp; without has_seen_times, only if it ever was.
     """
 
     at: Callable[[int], KnownFields]
@@ -77,7 +77,7 @@ class KnownScene:
     figures: Callable[[], Mapping[str, Any]] = dict
 
     def age_s(self, stamp_ns: int) -> float:
-        """Age [s] of the scene in use (a field: from its moment); NaN without times."""
+        """Age [s] of the scene in use (of a field, from `moment_ns`); NaN without times."""
         if self.moment_ns is not None:
             return abs(stamp_ns - self.moment_ns) * 1e-9
         index = self._index_at(stamp_ns)
@@ -89,7 +89,7 @@ class KnownScene:
         return None if index < 0 else self.stamps_ns[index]
 
     def step_at(self, stamp_ns: int) -> SceneStep | None:
-        """The two newest scenes at a stamp, None if there is only one."""
+        """Two newest scenes at a stamp, None with only one."""
         index = self._index_at(stamp_ns)
         if index < 1:
             return None
@@ -105,7 +105,7 @@ class KnownScene:
         return next((known for known in self.known_ns[later : later + 1] if known <= latest), None)
 
     def own_ns(self, stamp_ns: int) -> int:
-        """Stamp [ns] at which depth of this time is the newest known; `stamp_ns` without times."""
+        """Stamp [ns] at which depth of `stamp_ns` is the newest known; `stamp_ns` without times."""
         if not self.known_ns:
             return stamp_ns
         newest = max(0, bisect_right(self.stamps_ns, stamp_ns) - 1)
@@ -120,7 +120,7 @@ class KnownScene:
 def fields_at(
     known_ns: Sequence[int], key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
 ) -> Callable[[int], KnownFields]:
-    """Return a lookup of the newest scene at a stamp; it keeps the last NUM_CACHED.
+    """Return a lookup of the newest scene at a stamp, which caches the last NUM_CACHED.
 
     The lookup raises NotEvaluableError before the first scene is known.
     """
@@ -175,9 +175,9 @@ def read_grid_scene(path: Path) -> KnownScene:
 
 
 def read_splat_scene(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
-    """Read a reconstruction; each stamp uses the newest snapshot as old as the latency.
+    """Read a reconstruction; each stamp uses the newest snapshot at least `latency_ns` old.
 
-    Known space is where a camera looked, or the robot ever was in the log.
+    Known space is what a camera saw, or the robot swept, at any time of the log.
     """
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
@@ -243,13 +243,13 @@ def _grid_seen(observed: Observed, grid: DistanceGrid) -> Seen:
 
 
 def known_space(occupancy: OccupancyGrid) -> Observed:
-    """Look up whether a camera saw a place or the robot swept it."""
+    """Return a lookup of places that a camera saw or the robot swept."""
     known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     return partial(observed_at, known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
 def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: Balls | None = None) -> KnownFields:
-    """Exact and barrier field of the obstacles; people count nearer in the barrier (`control.human_margin`)."""
+    """Exact and barrier field of the obstacles; people are nearer in the barrier (`control.human_margin`)."""
     obstacles = obstacle_spheres(splats, unrepresented)
     chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)

@@ -1,4 +1,4 @@
-"""A log's reconstruction in lockstep with its replay's clock."""
+"""Reconstruction of a log in lockstep with its replay's clock."""
 
 import time
 from bisect import bisect_right
@@ -46,8 +46,8 @@ from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep
 
-FOLDER = "scene"  # within the replay's
-END: tuple[TimeStep | None, float] = (None, 0.0)  # of the frame sets
+FOLDER = "scene"  # within the replay's folder
+END: tuple[TimeStep | None, float] = (None, 0.0)  # after the last frame set
 
 
 def check_lockstep(request: ReplayRequest) -> None:
@@ -89,7 +89,7 @@ def choose_scene(
 ) -> KnownScene:
     """Open the request's scene; --lockstep reconstructs `source` into `folder`.
 
-    `observe` is called with every frame of that log.
+    `observe` is called with every frame of `source`.
     """
     if request.field is not None:
         refuse_if(
@@ -115,10 +115,10 @@ def reconstruct_scene(
     source: RecordSource | None = None,
     observe: Callable[[RgbdFrame], None] | None = None,
 ) -> KnownScene:
-    """Reconstruct a log as the replay goes, into `folder`/scene.
+    """Reconstruct a log during its replay, into `folder`/scene.
 
-    source: the log, if open already. observe: called with every frame, at last in `finish`. Raises InputError for a
-    log without frames or a clock.
+    source: the log, if open already. observe: called with every frame, the last ones in `finish`. Raises InputError
+    for a log without frames or a clock.
     """
     config = request.config
     source = _training_source(request, model, source)
@@ -158,12 +158,11 @@ def reconstruct_scene(
 
 
 class Lockstep:
-    """Frame sets still to come, and stamps and files of the maps so far.
+    """Frame sets to come, and stamps and files of maps so far.
 
-    ends_with_log: known space is of the whole log, else of the frame sets passed. is_real_time: a map but the
-    first is known when this machine has computed it (its known space, when it begins); of the frame sets that come
-    meanwhile only the newest waits.
-    held_out_every: one in so many is evidence and left out.
+    ends_with_log: known space is that of the whole log, else of the frame sets taken. is_real_time: each map but the
+    first is known when this machine has computed it (its known space when the computation begins). Of the frame sets
+    that arrive meanwhile, only the newest is kept. held_out_every: k if each k-th set is evidence and left out.
     """
 
     def __init__(
@@ -188,7 +187,8 @@ class Lockstep:
         self._stamps_ns: list[int] = []
         self._known_ns: list[int] = []
         self._files: list[Path] = []
-        self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
+        # known space, after a number of frame sets
+        self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))
 
     def scene(self) -> KnownScene:
         """Return the scene of a replay; take frame sets up to the first map now."""
@@ -267,7 +267,7 @@ class Lockstep:
             self._files.append(snapshot.path)
 
     def _skip(self, free_ns: int) -> None:
-        """Drop all but the newest of the frame sets that came until now."""
+        """Drop all but the newest of the frame sets that came until `free_ns`."""
         self._free_ns = free_ns
         while self._next is not None and self._next.stamp_ns + self._latency_ns <= free_ns:
             newer, decoding = next(self._steps, END)
@@ -292,7 +292,7 @@ class Lockstep:
         return known(points)
 
     def _finish(self) -> None:
-        """Write a scene folder; later frames go to `observe` alone."""
+        """Write a scene folder; remaining frames go only to `observe`."""
         fitted = self._fitted
         if fitted.observe is not None:
             deque(self._steps, maxlen=0)

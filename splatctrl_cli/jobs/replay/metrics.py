@@ -45,10 +45,10 @@ num_states: Callable[[Replay], int] = attrgetter("num_states")
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """One figure of a replay: its value, and its number of states, links or points.
+    """Figure of a replay: its value, and its number of states, links or points.
 
-    running: its value before the first state, and up to each (T,); None if not of states. column: of ``steps.csv``,
-    if any shows it; pick: its row there: "least", "largest", or a word.
+    running: the value before the first state, and values (T,) up to each state; None if not of states. column: of
+    ``steps.csv`` that shows the figure, or empty; pick: the row there: "least", "largest", or a word.
     """
 
     name: str
@@ -73,7 +73,8 @@ def _of(
 ) -> Measure:
     """A fold of a column (T,) of the trace, or of one `part` of it.
 
-    where: fold 1 where true, else 0. count: by default of states with a value. shown: column of ``steps.csv``.
+    where: fold 1 where this is true, else 0. count: by default the states with a value. shown: column of
+    ``steps.csv``.
     """
 
     def values(replay: Replay) -> Float64:
@@ -327,7 +328,7 @@ def metrics_of(replay: Replay) -> Metrics:
 
 
 def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[str, int]:
-    """Number of states, intervals, spheres or points behind each metric, by default the judged states."""
+    """Number of states, intervals, spheres or points behind each metric, by default judged states."""
     counts = dict.fromkeys(metrics, replay.num_states)
     counts |= {metric.name: metric.count(replay) for metric in _metrics_of(replay)}
     for field, agreement in replay.agreement.items():
@@ -339,7 +340,7 @@ def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics) -> dict[st
 def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
     """First time [s] at which a metric over the states so far does not hold.
 
-    None for metrics that are not of single states.
+    None also for metrics that are not of states.
     """
     measure = next((of for of in _metrics_of(replay) if of.name == metric), None)
     if measure is None or measure.running is None:

@@ -79,7 +79,7 @@ def _ask(request: ReplayRequest, inputs: ReplayInputs, console: Progress) -> Rep
 def _measure_change(
     scene: KnownScene, record: ReplayRecord, before_ns: int, stamp_ns: int, position: Float64
 ) -> Iterator[SceneChange]:
-    """The change between scenes of two stamps for the arm at (1, J)."""
+    """Change between the scenes of two stamps, for the arm at `position` (1, J)."""
     if scene.at(before_ns) is not scene.at(stamp_ns):
         before, after = (record.clearance_in(ns, np.array([stamp_ns]), position)[0] for ns in (before_ns, stamp_ns))
         yield SceneChange(stamp_ns=stamp_ns, before=float(before), after=float(after))

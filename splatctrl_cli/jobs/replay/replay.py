@@ -156,7 +156,7 @@ def _notes(judged: Judged) -> Iterator[str]:
 
 
 def waivers(request: ReplayRequest) -> Iterator[str]:
-    """Options and settings of evidence and margins laxer than their defaults."""
+    """Settings of evidence and margins laxer than their defaults."""
     usual = ReplayRequest(log=request.log, out=request.out)
     for name in (*LARGER_IS_LAXER, *SMALLER_IS_LAXER):
         value, default = (attrgetter(name)(each) for each in (request, usual))
@@ -188,7 +188,7 @@ def _declared_notes(judged: Judged) -> Iterator[str]:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ReplayResult(JudgedResult):
-    """A replay's result; notes: on robot, pictures and log; is_damaged: log parts were lost."""
+    """Replay's result; notes: on robot, pictures and log; is_damaged: log parts were lost."""
 
     inputs: ReplayInputs
     replay: Replay
@@ -203,7 +203,7 @@ class ReplayResult(JudgedResult):
 
 
 def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
-    """Replay, and write the output folder. Raises SplatCtrlError if that is impossible."""
+    """Replay, and write the output folder. Raises SplatCtrlError."""
     check_request(request)
     config, stopwatch = request.config, Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
@@ -284,7 +284,7 @@ def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tupl
     frames = seen if surfaces is None else surfaces.watching(seen)
     sights = worst_sights(inputs, replay, request.worst_frames, frames)
     if surfaces is not None:
-        for _ in frames:  # those that no moment needs
+        for _ in frames:  # frames that no moment needs
             pass
         replay = add_agreement(replay, surfaces)
     return replay, sights
@@ -293,7 +293,7 @@ def _watch(request: ReplayRequest, inputs: ReplayInputs, replay: Replay) -> tupl
 def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
-    """`motion` sees every frame of the log now, or during a lockstep."""
+    """Read the inputs; `motion` gets every frame of the log now, or during a lockstep."""
     model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
         (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")

@@ -37,7 +37,7 @@ BLOCK = 1024  # states that are replayed at once
 class Trace(Mapping[str, Any]):
     """T states as `NamedColumns`, appended in blocks.
 
-    Words name who or where: `nearest_exact` of `clearance_exact`.
+    Word columns name spheres or places: `nearest_exact` belongs to `clearance_exact`.
     """
 
     def __init__(self) -> None:
@@ -56,19 +56,19 @@ class Trace(Mapping[str, Any]):
                 file.extend(values)
 
     def __len__(self) -> int:
-        """The number of columns."""
+        """Number of columns."""
         return len(self._columns)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._columns)
 
     def __getitem__(self, name: str) -> Any:
-        """All numbers (T, ...) of a column, or its words (T,), read where needed."""
+        """All numbers (T, ...) of a column, or its words (T,), read when indexed."""
         column = self.rows(name)
         return np.asarray(column) if isinstance(column, Rows) else column
 
     def rows(self, name: str) -> Any:
-        """A column (T, ...), read where needed: `Rows` of numbers, or words."""
+        """Column (T, ...), read when indexed: `Rows` of numbers, or words."""
         file = self._columns[name]
         return Rows(file) if isinstance(file, RowFile) else file
 
@@ -89,16 +89,15 @@ JUDGE, OCCUPIED = "judge", "occupied"  # space that no camera saw free: judged b
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayRequest(RobotOptions, RunOptions):
-    """One replay: the options of ``splatctrl replay``, by name.
+    """Options of ``splatctrl replay``, by name.
 
-    log: read by `options`. urdf: None for the robot of the log. The scene is `scene` (a reconstruction), `field` (a
-    baked grid) or `lockstep` (reconstruct meanwhile, on `device`). real_time: a map of a lockstep is known when it is
-    computed. Times are in seconds; start_time may be "first-map". evidence: a held-out camera, or k for each k-th
-    frame set. require_evidence, require_proof: no pass
-    without evidence, or with space assumed free. unseen: `JUDGE` or `OCCUPIED`. controller: a user's class
-    ``module:Class``, a policy server's URL, or "recorded" for the log's commands; controller_command: a program
-    (docs/controllers.md). separation: a TOML file of declared inputs (docs/separation.md). report_only: the verdict
-    sets no exit code, except by `require`.
+    log: read with `options`. urdf: None for the robot of the log. The map is `scene` (a reconstruction), `field` (a
+    baked grid), or `lockstep` (reconstructed meanwhile, on `device`). real_time: a lockstep's map is known once it is
+    computed. Times are in seconds; start_time may be "first-map". evidence: a held-out camera, or k to hold out each
+    k-th frame set. require_evidence: no pass without evidence. require_proof: no pass with space assumed free.
+    unseen: `JUDGE` or `OCCUPIED`. controller: a user's class ``module:Class``, a policy server's URL, or "recorded"
+    for the log's commands; controller_command: a program (docs/controllers.md). separation: a TOML file of declared
+    inputs (docs/separation.md). report_only: only the gates `require` set the verdict's exit code.
     """
 
     log: Path
@@ -146,7 +145,7 @@ class ReplayRequest(RobotOptions, RunOptions):
 class ReplayInputs:
     """All inputs of a replay; states in the model's joint order.
 
-    surfaces: of links, None if unreadable. pair_margins: lowered ones.
+    surfaces: of links, None if unreadable. pair_margins: lowered margins of link pairs.
     """
 
     source: RecordSource
@@ -168,10 +167,10 @@ class ReplayInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class MapError:
-    """The map's error by held-out frame sets; `bound` is None if they are too few.
+    """Map error by held-out frame sets; `bound` is None for too few sets.
 
-    num_sets: in the judged time; num_seen: with points near the motion. time_s (since the first judged state), place
-    (3,) [m]: where the miss equals the bound, which is at least 0.
+    num_sets: in the judged time; num_seen: sets with points near the motion. time_s (since the first judged state),
+    place (3,) [m]: of the point whose error is the bound. A negative bound is set to 0.
     """
 
     source: str
@@ -185,7 +184,7 @@ class MapError:
 
 @dataclass(frozen=True, kw_only=True)
 class SeparationInput:
-    """An input of the protective separation distance; source: measured, declared or assumed."""
+    """Input of the protective separation distance; source: measured, declared or assumed."""
 
     symbol: str
     value: float | None = None
@@ -196,7 +195,7 @@ class SeparationInput:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneChange:
-    """A newer scene: least clearance [m] of the unmoved arm's surface before and after."""
+    """Newer scene; before, after: least clearance [m] of the unmoved arm's surface without and with it."""
 
     stamp_ns: int
     before: float
@@ -210,13 +209,13 @@ class SceneChange:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """A finished replay of T states in one of MODES; fields: names of distances.
+    """Finished replay of T states in one of MODES; fields: names of distances.
 
-    trace: as in `ReplayRecord`; `step_columns` or those of `open_loop` with a controller; `divergence_*` of a closed
-    loop from the log (joints [rad], position [m], rotation [rad]); `clearance_true` if known. num_before_scene:
-    states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state. statics, closest: as
-    in `ReplayRecord`. unwatched, overtaken: from later depth. separation: inputs of the protective distance.
-    outside: a user's controller.
+    trace: columns of `ReplayRecord`, with a controller also those of `step_columns` or `open_loop`. A closed loop
+    adds `divergence_*` from the log (joints [rad], position [m], rotation [rad]); a truth adds `clearance_true`.
+    num_before_scene: states left out before the first scene, over lead_in_s [s]. start_time_s: of the first state.
+    statics: first and least clearance [m] of fixed spheres. closest: as in `ReplayRecord`. unwatched, overtaken:
+    states that later depth contradicts. separation: inputs of the protective distance. outside: a user's controller.
     """
 
     model: RobotModel
@@ -248,5 +247,5 @@ class Replay:
 
     @property
     def margin(self) -> float:
-        """The least clearance allowed [m]."""
+        """Least clearance allowed [m]."""
         return self.config.control.margin

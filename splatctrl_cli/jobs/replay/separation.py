@@ -1,4 +1,4 @@
-"""Separation of a replayed arm from people, by the declared inputs of ``--separation`` (ISO/TS 15066, 5.5.4)."""
+"""Separation of a replayed arm from people, by declared inputs (``--separation``; ISO/TS 15066, 5.5.4)."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -58,9 +58,9 @@ def check_separation(request: ReplayRequest) -> None:
 
 
 def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay) -> Replay:
-    """Add the separation: columns to the trace, inputs and figures to the replay.
+    """Add columns of the separation to the trace, and its inputs to the replay.
 
-    Raises InputError for maps without times, or without any labelled person where labels are to tell.
+    Raises InputError for maps without times, or if labels define people and no map has any.
     """
     separation_inputs = (
         *_person_inputs(declared),
@@ -94,7 +94,7 @@ def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
 def _number(
     symbol: str, unit: str, declared_value: float | None, how: str, default: float, why: str
 ) -> SeparationInput:
-    """The declared number, else the assumed one and why."""
+    """Declared number, else the assumed one and why."""
     if declared_value is not None:
         return SeparationInput(symbol=symbol, value=declared_value, unit=unit, source=DECLARED, how=how)
     return SeparationInput(symbol=symbol, value=default, unit=unit, source=ASSUMED, how=why)
@@ -132,7 +132,7 @@ def _time_inputs(declared: DeclaredSeparation, inputs: ReplayInputs) -> Iterator
 
 
 def _distance_inputs(declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay) -> Iterator[SeparationInput]:
-    """The constant parts of Z_d and Z_r."""
+    """Constant parts of Z_d and Z_r."""
     figures, map_error = inputs.scene.figures(), replay.map_error
     if declared.map_error is None and map_error is not None and map_error.bound is not None:
         how = f"bound on the map's error, {100 * map_error.bound.confidence:.3g} % confidence; plus v_h times the age"
@@ -150,7 +150,7 @@ def _distance_inputs(declared: DeclaredSeparation, inputs: ReplayInputs, replay:
 
 
 def evidence_age(trace: Trace) -> Float64:
-    """Age (T,) [s] of the depth about the arm: the map's, plus its lag when last evaluated."""
+    """Age (T,) [s] of depth about the arm: the map's age, plus the lag when last evaluated."""
     of_map, of_arm = trace["map_age_s"], trace["evidence_age"]
     looked = np.flatnonzero(np.isfinite(of_arm))
     before = np.searchsorted(looked, np.arange(len(of_map)), side="right")
@@ -159,7 +159,7 @@ def evidence_age(trace: Trace) -> Float64:
 
 
 class _SeparationPass:
-    """Columns of the separation, block by block; number: by symbol, of the inputs."""
+    """Columns of the separation, block by block; number: the inputs by symbol."""
 
     def __init__(
         self, declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay, number: dict[str, float | None]
@@ -184,7 +184,7 @@ class _SeparationPass:
         self.surfaces = _Surfaces(declared, inputs)
 
     def columns(self, first: int, last: int) -> NamedColumns:
-        """Columns of the sphere with the least margin. States `first` to `last` see one scene."""
+        """Columns of the sphere with the least margin. States `first` to `last` share one scene."""
         stamp, q = int(self._trace.rows("stamp_ns")[first]), self._trace.rows("q")[first:last]
         robot, (people, statics) = self._inputs.model.at(stamp), self.surfaces.at(stamp)
         centers = robot.sphere_centers_batch(q)
@@ -246,7 +246,7 @@ class _SeparationPass:
     def _stop_clearance(
         self, robot: RobotModel, q: Float64, motion: ArmMotion, stop: Stop, statics: "_Balls | None"
     ) -> Float64:
-        """Bound (T,) [m] of the clearance to static surfaces along a straight stop in joint space."""
+        """Lower bound (T,) [m] of the clearance to static surfaces along a straight stop in joint space."""
         way = motion.joint_speed * self._number["T_r"] + np.sign(motion.joint_speed) * stop.joint_travel
         shares = np.linspace(0.0, 1.0, STOP_POSTURES)
         postures = (q[:, None] + shares[:, None] * way[:, None]).reshape(-1, q.shape[1])
@@ -256,7 +256,7 @@ class _SeparationPass:
 
 
 def _joint_speeds(inputs: ReplayInputs, replay: Replay) -> Float64:
-    """Joint velocities (T, J), of a driven arm its commands or 0."""
+    """Joint velocities (T, J): logged, or a driven arm's commands (0 without one)."""
     if replay.closed_loop is not None:
         return np.asarray(np.nan_to_num(replay.trace["v"]), np.float64)
     stamps = replay.trace.stamp_ns
@@ -292,7 +292,7 @@ def _clearances(
 
 
 class _Surfaces:
-    """Surfaces of people and static ones, by the scene known at a stamp."""
+    """Surfaces of people and static surfaces, in the scene known at a stamp."""
 
     def __init__(self, declared: DeclaredSeparation, inputs: ReplayInputs) -> None:
         self._declared, self._scene = declared, inputs.scene
@@ -344,7 +344,7 @@ def _figures(replay: Replay, metrics: Metrics) -> dict[str, float | None]:
 
 
 def separation_document(replay: Replay, metrics: Metrics) -> dict[str, Any]:
-    """The content of ``separation.json``."""
+    """Content of ``separation.json``."""
     return {
         "standard": "ISO/TS 15066:2016, 5.5.4.2.3: S_p = S_h + S_r + S_s + C + Z_d + Z_r",
         "claim": NO_CLAIM,

@@ -55,7 +55,7 @@ NEAR_COLUMNS: Mapping[str, tuple[int, ...]] = {  # columns of evidence about the
 
 
 def blocks_of(scene: KnownScene, robot: RobotModel, stamps: Stamps) -> Iterator[tuple[int, int]]:
-    """Ranges of at most BLOCK of stamps (T,), with one scene and robot surface each."""
+    """Ranges of at most BLOCK stamps (T,), each with one scene and one robot surface."""
     first = 0
     while first < len(stamps):
         known, last = scene.at(int(stamps[first])), first + 1
@@ -68,14 +68,16 @@ def blocks_of(scene: KnownScene, robot: RobotModel, stamps: Stamps) -> Iterator[
 
 
 class ReplayRecord:
-    """Audit of T states in the scenes known at their times, with what happened.
+    """Audit of T states in the scenes known at their times.
 
-    trace: `audit_columns`, and by state: `obstacle`, in words, the nearest to the nearest sphere; `map_age_s`;
-    `clearance_between` [m]: bound since the state before, NaN at the first, `is_met`: 1 if a posture on the way has
-    it; `unbounded_s`: time without a bound; `clearance_surface` [m]: of the body; `clearance_splats` [m]: of the
-    spheres to splats alone; `velocity_share`, `acceleration_share` of the limits, with their joints; `NEAR_COLUMNS`,
-    NaN where not evaluated. hindsight: later depth about unwatched times. newer_depth: states judged by a late map.
-    closest: of link pairs below their margin, gap [m] and stamp.
+    trace: `audit_columns`, and columns by state. `obstacle`: in words, the nearest to the closest sphere.
+    `map_age_s`. `clearance_between` [m]: bound since the state before, NaN at the first; `is_met`: 1 if a posture on
+    the way attains the bound. `unbounded_s`: time without a bound. `clearance_surface` [m]: of the body.
+    `clearance_splats` [m]: of the spheres to splats only. `velocity_share`, `acceleration_share`: of the limits, with
+    their joints. `NEAR_COLUMNS`: NaN where not evaluated.
+
+    hindsight: later depth that covers times without depth about the arm. newer_depth: later depth of states judged by
+    an older map. closest: gap [m] and stamp of link pairs below their margin.
     """
 
     def __init__(
@@ -94,7 +96,7 @@ class ReplayRecord:
         """Start an empty record.
 
         is_continuous: False if the arm is re-anchored, so that nothing is bounded between states. declared: intended
-        contact, its times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
+        contact, at times from `first_state_ns`. surfaces: for self-collision; None uses the spheres.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.trace = Trace()
@@ -124,7 +126,7 @@ class ReplayRecord:
         self._was_free: Bool | None = None  # voxels (X, Y, Z), in any scene before
 
     def measure_block(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
-        """Audit and store the next block of states (T, J), which see one scene."""
+        """Audit and store the next block of states (T, J), which share one scene."""
         scene, self._model = self._scene, self._robot.at(int(stamps[0]))
         part = audit(self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
         part = self._look_at_self(self._judge_scene(part))
@@ -183,10 +185,10 @@ class ReplayRecord:
     def _approached(
         self, stamps: Stamps, positions: Float64, each: Float64, pick: Callable[[KnownFields], DistanceFunction]
     ) -> Float64:
-        """Clearances `each` (T, M) [m], lowered linearly in time to the next map's.
+        """Lower clearances `each` (T, M) [m] linearly in time to the next map's clearances.
 
-        This assumes that objects approach at constant speed. Maps known late, or over `UNWATCHED_NS` apart, change
-        nothing. pick: the distance of a map.
+        This assumes that objects approach at constant speed. Maps known later than their stamp, or over
+        `UNWATCHED_NS` apart, change nothing. pick: selects a map's distance.
         """
         scene, now_ns = self._scene, int(stamps[0])
         first, next_ns = scene.depth_ns(now_ns), scene.next_ns(now_ns)
@@ -243,7 +245,7 @@ class ReplayRecord:
         return part
 
     def _bound(self, part: AuditTrace, velocities: Float64) -> NamedColumns:
-        """Bound the clearance since each state before, in this block's scene."""
+        """Bound the clearance between each state and the state before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
         name = "certified" if "certified" in known else "exact"
         is_surface = part_clearances(self._model, part.position[:1], known[name])[1]
@@ -341,7 +343,8 @@ class ReplayRecord:
 def _fold_accounts(accounts: Sequence[Account]) -> dict[str, float | Float64]:
     """Fold the accounts of a state and the postures before it.
 
-    Shares are of the state; distances are the least and unseen shares the largest of all.
+    Shares by class are the state's own. Distances are the least, unseen and assumed shares the largest over all
+    postures.
     """
     shares, nearest = (np.array([getattr(each, name) for each in accounts]) for name in ("shares", "nearest"))
     least, places = nearest.argmin(axis=0), np.array([each.places for each in accounts])

@@ -39,15 +39,15 @@ MOST_PICTURES, PICTURE_WIDTH = 24, 560  # number and width [px] for recordings a
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest(FolderRequest):
-    """A page on a run, scene, field, grid or splat file; out: None for PATH.html."""
+    """Page on a run, scene, field, grid or splat file; out: None for PATH.html."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WriteReportRequest(ViewRequest):
-    """A report on a run's or batch's folder into HTML; out: None for PATH.html.
+    """HTML report on a run's or batch's folder; out: None for PATH.html.
 
-    against: an earlier run, batch or baseline to compare with. all_scenes: of a batch in 3-D, not only failed,
-    changed and worst ones.
+    against: an earlier run, batch or baseline to compare with. all_scenes: show all of a batch in 3-D, not only
+    failed, changed and worst scenes.
     """
 
     against: Path | None = None
@@ -101,9 +101,9 @@ def write_page_of_runs(
     tables: Sequence[Table],
     views: Sequence[Picture],
 ) -> None:
-    """Write a page with a verdict, tables, and runs by heading; replace an earlier one.
+    """Write a page with a verdict, tables, and runs by heading; replace an earlier page.
 
-    views: pictures of a map. The page shows replays in 3-D, or a map if there are none.
+    views: pictures of a map. The page shows replays in 3-D, or a map if it is the only run.
     """
     scenes, sections = dict[str, str](), list[RunSection]()
     for heading, run in runs.items():

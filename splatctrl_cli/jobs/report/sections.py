@@ -34,7 +34,7 @@ PICTURES = {  # captions by start of file name
 def section_of(
     run: RunFolder, *, anchor: str, title: str, most_pictures: int | None = None, width: int = WIDTH
 ) -> RunSection:
-    """Section of a run without its scene; width: of its pictures [px]."""
+    """Section of a run without its 3-D scene; width: of the pictures [px]."""
     verdict = run.verdict
     states = run.states
     replayed: dict[str, Any] = {}
@@ -156,8 +156,8 @@ STATES: Mapping[str, str] = {Change.WORSE: "failed"}  # of a row
 def changes_since(before: Path | None, after: Path, *, has_links: bool) -> tuple[list[Table], frozenset[str]]:
     """Tables of changes, the second folded, and the jobs with a regression or another verdict.
 
-    before: a folder or baseline; None for no tables. has_links: each job has a section. Raises InputError
-    if they cannot be compared.
+    before: a folder or baseline; None for no tables. has_links: link each job to its section. Raises InputError if
+    the runs cannot be compared.
     """
     if before is None:
         return [], frozenset()

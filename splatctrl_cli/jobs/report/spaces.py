@@ -37,7 +37,7 @@ PLACE = re.compile(r"at \((-?[\d.]+), (-?[\d.]+), (-?[\d.]+)\)")
 
 
 def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
-    """Scene of a run, scene or field folder, splat file or field.
+    """3-D scene of a run, scene or field folder, splat file or field.
 
     Raises InputError for anything else, or if a run's scene or robot is missing.
     """
@@ -92,7 +92,7 @@ def space_of_grid(path: Path) -> Space:
 
 
 def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
-    """A replay's scene as known over time, its robot's motion, and what decided."""
+    """Replay's scene as known over time, its robot's motion, and the deciding place."""
     states = require(run.states, f"{run.path}: no steps.csv", remedy="replay again")
     robot = robot_of(run, states, roots)
     deciding = _deciding(run, states, robot)
@@ -180,7 +180,7 @@ def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
 
 
 def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
-    """Snapshots a replay used, each with the motion time [s] it was known from."""
+    """Snapshots a replay used, each with the motion time [s] at which it became known."""
     latency = float(run.option("--latency") or 0.0)
     delays = scene.run.get("metrics", {}).get(MAP_DELAYS) or [latency] * len(scene.snapshots)
     first, last = int(states.stamps_ns[0]), int(states.stamps_ns[-1])
@@ -191,7 +191,7 @@ def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple
 
 
 def spread(times: list[float], when: float) -> list[int]:
-    """Indices of at most 5 of `times`: first, last, the one at `when`, others evenly."""
+    """Indices of at most 6 `times`: first, last, newest at `when`, others equally spaced."""
     if not times:
         return []
     at, most = max((i for i, time in enumerate(times) if time <= when), default=0), min(len(times), 5)
@@ -203,7 +203,7 @@ def spread(times: list[float], when: float) -> list[int]:
 
 
 def _add_seen(space: Space, known: SceneFolder | Snapshot | None, scene: SceneFolder) -> Space:
-    """Add cameras at their start, and the space without evidence, by class."""
+    """Add cameras at their first poses, and space without evidence by class."""
     space = replace(space, cameras=[_camera(row) for row in scene.made_from.get("first_frames", [])])
     seen = None if known is None else known.seen()
     if seen is None:

@@ -1,4 +1,4 @@
-"""The robot of a job: of --urdf, or the log's own."""
+"""Robot of a job: from --urdf, or described by the log."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class RobotOptions:
     locked: Mapping[str, float] = field(default_factory=dict)
 
     def posed(self, urdf: UrdfFile, otherwise: SphereSet | None = None) -> RobotModel:
-        """Robot of a URDF, with the spheres `otherwise` if none are given. Raises InputError."""
+        """Robot of a URDF, with the given spheres, else `otherwise`. Raises InputError."""
         spheres = otherwise if self.spheres is None else self.spheres
         return RobotModel.from_urdf(
             urdf,
@@ -51,13 +51,13 @@ class RobotOptions:
         )
 
     def refuse_without_robot(self) -> None:
-        """Raise UsageError for an option given where there is no robot."""
+        """Raise UsageError for a robot option without a robot."""
         for name, option in (("spheres", "spheres"), ("base", "base"), ("locked", "lock"), ("packages", "packages")):
             refuse_if(getattr(self, name), f"--{option}: needs the robot", **GIVE_ROBOT)
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
-    """Robot described by logs, or None. Raises InputError for several or an invalid one."""
+    """Robot described by logs, or None. Raises InputError for several robots or an invalid one."""
     robots = logged_descriptions(paths)
     refuse_if(
         len(robots) > 1,
@@ -70,7 +70,7 @@ def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
 def installed_urdf(name: str) -> Path:
     """File NAME.urdf of an installed Python package; downloads nothing.
 
-    Raises UsageError if there is none, or several.
+    Raises UsageError for none or several.
     """
     files = [file for package in distributions() for file in package.files or () if file.suffix == ".urdf"]
     matches = sorted({Path(str(file.locate())).resolve() for file in files if file.stem == name})
@@ -100,7 +100,7 @@ def urdf_of(urdf: Path | None, paths: Sequence[Path], progress: Progress = SILEN
 def add_self_model(model: RobotModel, file: Path | None, scene: Path | None = None) -> RobotModel:
     """Add a self-model (`robot learn`): the given file, else the scene's if of this robot.
 
-    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or another robot's.
+    `NO_SELF_MODEL` adds nothing. Raises InputError for an unreadable file, or a given file of another robot.
     """
     path = scene / SELF_MODEL if file is None and scene is not None else file
     if path is None or path == NO_SELF_MODEL or (file is None and not path.is_file()):
@@ -125,7 +125,7 @@ def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
 
 
 def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
-    """Describe how a model differs from all in the logs, or empty."""
+    """Difference of a model from every logged robot; empty if one agrees."""
     words = []
     for path, where, text in logged_descriptions(paths):
         try:

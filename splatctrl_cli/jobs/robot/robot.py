@@ -43,7 +43,8 @@ from splatctrl_cli.robot.sphere_files import (
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
-DEFAULT_MARGIN = ControlConfig().margin  # [m] that a controller keeps: what is farther outside may touch all the same
+# [m] that a controller keeps: surface farther outside its sphere may still touch
+DEFAULT_MARGIN = ControlConfig().margin
 SCALES = {
     "max_deficit": ERROR,
     "uncovered_share": BAD_SHARE,
@@ -64,10 +65,10 @@ METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths [m],
 
 @dataclass(frozen=True, kw_only=True)
 class RobotRequest(RobotOptions):
-    """A robot, and the options of its jobs.
+    """Robot, and the options of its jobs.
 
-    Fit and check: `picture`, and gates `require` on METRICS. Pairs: `srdf`, or `postures` to sample, and `drop_never`
-    for pairs that never come near.
+    Fit and check use `picture` and gates `require` on METRICS. Pairs uses `srdf`, or `postures` to sample, and
+    `drop_never` to omit pairs that are never close.
     """
 
     urdf: Path
@@ -110,7 +111,7 @@ def _figures(report: CoverageReport) -> dict[str, Any]:
 
 
 def fit_robot(request: RobotRequest, progress: Progress = SILENT) -> CoverageResult:
-    """Fit spheres to each link's collision geometry, write them, and measure them."""
+    """Fit spheres to each link's collision geometry; write and measure them."""
     check_gate_names(request.require, METRICS)
     with output_path(request.out, force=request.force, is_folder=False) as partial:
         urdf = read_urdf(request.urdf)
@@ -162,7 +163,7 @@ def check_robot(request: RobotRequest) -> CoverageResult:
 
 
 def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, Any]]:
-    """Find links that may collide, and why others may not; also as a document."""
+    """Find link pairs that may collide, and why other pairs cannot; also as a document."""
     model = RobotModel.from_urdf(request.urdf, request.spheres, locked=request.locked)
     disabled, foreign = ({}, []) if request.srdf is None else read_srdf(request.srdf, model.urdf)
     pairs = self_collision_pairs(
@@ -190,9 +191,9 @@ def robot_pairs(request: RobotRequest) -> tuple[SelfCollisionPairs, dict[str, An
 
 
 def describe_robot(request: RobotRequest) -> tuple[RobotModel, dict[str, Any]]:
-    """Read a robot, and its document. By default the spheres are the URDF's own.
+    """Read a robot, and describe it. By default the spheres are the URDF's own.
 
-    Limits are in rad or m, velocities per second; meshes_not_found: sentences.
+    Limits are in rad or m, velocities per second; meshes_not_found: error sentences.
     """
     urdf, lost = read_urdf(request.urdf), []
     locked = urdf.add_followers(request.locked)
@@ -250,7 +251,7 @@ def _verdict(
 ) -> Verdict:
     """Fail for surface more than `allowed` [m] outside the spheres, or a bare moving link.
 
-    A gate on max_deficit replaces that.
+    A gate on max_deficit replaces the limit.
     """
     num, bare = len(report.links), bare_links(report)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)

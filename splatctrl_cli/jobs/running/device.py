@@ -1,4 +1,4 @@
-"""The device of a fit or bake, and the continuation of an interrupted run."""
+"""Device of a fit or bake, and the continuation of an interrupted run."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ INSTALL = "pip install 'splatctrl-cli[cuda]'"
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Options of a job; threads: 0 for one per core; device: as of --device."""
+    """Options of a job; threads: 0 for one per core; device: text of --device."""
 
     config: Config = field(default_factory=Config)
     force: bool = False
@@ -82,7 +82,7 @@ def demand_device(name: str, source: str = FIT) -> Device | None:
 def automatic(
     progress: Progress, too_little: str = "", *, name: str = CUDA, source: str = FIT, needed: int = 0
 ) -> Device:
-    """Choose a usable card with `needed` bytes, if the work is enough; log why."""
+    """Choose a card with `needed` free bytes if the work is enough; log the choice."""
     try:
         refuse_if(too_little, too_little, error=DeviceError)
         device = open_device(name, source)
@@ -98,16 +98,16 @@ def automatic(
 def choose_device(name: str, is_enough: bool, progress: Progress) -> Device:
     """Device of --device for fields; auto uses a card if the work is enough.
 
-    Raises UsageError if unusable.
+    Raises UsageError if it is unusable.
     """
     return demand_device(name, FIELD) or (automatic(progress, source=FIELD) if is_enough else Device())
 
 
 class FitDevice:
-    """The device of a fit, and its earlier ones.
+    """Device of a fit, and its earlier devices.
 
-    history: as in ``run.json``, with first iterations. auto starts where the work is worth it, and resumes where it
-    was. Raises UsageError for an unusable device.
+    history: devices as in ``run.json``, with first iterations. auto uses a card for enough work, and resumes on the
+    last device if usable. Raises UsageError for an unusable device.
     """
 
     def __init__(self, name: str = CPU) -> None:
@@ -116,7 +116,7 @@ class FitDevice:
         self.history: list[dict[str, Any]] = []
 
     def give(self, fitter: SceneFitter, frames: Sequence[RgbdFrame], progress: Progress) -> None:
-        """Move a fitter to the device; `frames` are its first time step."""
+        """Move a fitter to the device; `frames` are those of its first time step."""
         num_splats, window = fitter.config.max_splats, fitter.config.window
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
         sizes += [max(sizes)] * window
@@ -151,7 +151,7 @@ class FitDevice:
 
 @contextmanager
 def explain_faults(device: Device | FitDevice | None, checkpoint: Path | None = None) -> Iterator[None]:
-    """Raise a device's failure as DeviceFault, with a remedy from `checkpoint` if it exists."""
+    """Raise a device's failure as DeviceFault or DeviceFull; an existing `checkpoint` changes the remedy."""
     try:
         yield
     except DeviceError as error:
@@ -169,7 +169,7 @@ def describe_device(device: dict[str, Any]) -> str:
     return f"{device['device']}{card}"
 
 
-DECIDING_OPTIONS: Mapping[str, object] = {  # defaults that decide a scene's bytes, besides its configuration
+DECIDING_OPTIONS: Mapping[str, object] = {  # defaults of options that decide a scene's bytes, like its configuration
     **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
     **{
         "pairing_tolerance": 0.02,
@@ -190,7 +190,7 @@ def identity(
 ) -> dict[str, Any]:
     """Plain values that decide the bytes of a run; the number of threads does not.
 
-    options, files: by option name, files by content. inputs: sha256 of the recording's files.
+    options, files: by option name; a file counts by its content. inputs: sha256 of the recording's files.
     """
     values = {
         **deciding_versions(),
@@ -204,11 +204,11 @@ def identity(
 
 
 def deciding_versions() -> dict[str, str]:
-    """Versions of program, kernels and packages that may change a bit."""
+    """Versions of program, kernels and packages that may change a byte."""
     return {
         "splatctrl": __version__,
         "kernels": arithmetic(),
-        # packages whose versions may change a bit
+        # packages whose versions may change a byte
         **{name: metadata.version(name) for name in ("numpy", "scipy", "opencv-python-headless", "pin")},
     }
 
@@ -227,7 +227,7 @@ def advise_resumption(checkpoint: Path, folder: Path | None = None) -> Iterator[
 
 
 def check_resumption(checkpoint: Path, what: str, progress: Progress, *, resume: bool) -> bool:
-    """True if --resume finds a checkpoint; log one that is missing or replaced.
+    """True if --resume finds a checkpoint; log a missing or replaced checkpoint.
 
     what: "run" or "bake".
     """
@@ -240,7 +240,7 @@ def check_resumption(checkpoint: Path, what: str, progress: Progress, *, resume:
 
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
-    """Read a partial folder's checkpoint. Raises UsageError naming differences."""
+    """Read a partial folder's checkpoint. Raises UsageError naming differences from `now`."""
     checkpoint = read_checkpoint(folder)
     check_same_run(folder, checkpoint.progress["run"], now)
     return checkpoint

@@ -45,8 +45,8 @@ class Wait:
         self._done, now = done, time.monotonic()
         self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
-            return  # of what comes after it
-        if now - self._reported < 10.0:  # between two lines of one wait
+            return  # steps beyond the announced total
+        if now - self._reported < 10.0:  # [s] between two lines of one wait
             return
         self._reported, left = now, ""
         if self._total is not None and self._first is not None and done > self._first[1]:

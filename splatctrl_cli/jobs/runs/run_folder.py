@@ -24,8 +24,8 @@ REPLAY = "replay"
 class States:
     """Columns of a replay's ``steps.csv`` (T rows); NaN for empty cells.
 
-    seconds since the first. joints by name (T,). clearance [m] by measure (T,), `truth` included. rungs, obstacles
-    (T,).
+    seconds: since the first row. joints: (T,) by name. clearance: (T,) [m] by measure, including `truth`. rungs,
+    obstacles: (T,), or empty.
     """
 
     stamps_ns: Stamps
@@ -37,18 +37,18 @@ class States:
 
     @property
     def judged(self) -> Float64:
-        """Clearance (T,) [m] to the splats, else the least of any measure."""
+        """Clearance (T,) [m] to the splats, else the least of all measures."""
         measures = [self.clearance["exact"]] if "exact" in self.clearance else list(self.clearance.values())
         return np.asarray(np.fmin.reduce([np.full(len(self.seconds), np.nan), *measures]))
 
     def worst(self) -> int | None:
-        """State of least judged clearance, None without values."""
+        """Index of the least judged clearance, None without values."""
         return int(np.nanargmin(self.judged)) if np.isfinite(self.judged).any() else None
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A command's folder; words: its command line, if ``run.json`` has an outer program's."""
+    """Command's folder; words: its command line, if ``run.json`` records an outer program's."""
 
     path: Path
     run: Mapping[str, Any]
@@ -112,9 +112,9 @@ class RunFolder:
             return _states(read_columns(self.parts.checked(file)))
 
     def place_of(self, word: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
-        """Find a path of the command line: as typed, above the run, or below `roots`.
+        """Find a command line's path: as typed, in a parent folder, or in `roots`.
 
-        None if missing, or of another `digest`.
+        None if missing, or if its digest is not `digest`.
         """
         above = [Path(), *self.path.absolute().parents, *roots]
         places = [root / word for root in above if (root / word).exists()]
@@ -123,7 +123,7 @@ class RunFolder:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderRequest:
-    """A file `out` made from `path`; roots: folders with a replay's scene and robot."""
+    """File `out` made from `path`; roots: folders with a replay's scene and robot."""
 
     path: Path
     out: Path | None = None
@@ -132,13 +132,16 @@ class FolderRequest:
 
 
 def sibling_path(path: Path, ending: str) -> Path:
-    """Path of the same name in the same folder, with another ending."""
+    """Path of the same name and folder, with another ending."""
     place = path if path.name.strip(".") else Path(os.path.realpath(path))  # . and .. have no name of their own
     return place.with_name(f"{place.name if place.is_dir() else place.stem}{ending}")
 
 
 def open_run(path: Path) -> RunFolder:
-    """Open a run's folder. Raises InputError if it is no run, incomplete, or too new."""
+    """Open a run's folder.
+
+    Raises InputError if it is no run, incomplete, or of a newer version.
+    """
     partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
     refuse_if(
         partial.exists() and (partial == path or not path.exists()),
@@ -157,7 +160,7 @@ def open_run(path: Path) -> RunFolder:
         "command" not in run, f"{file}: expected what a command of splatctrl writes", remedy="make the run again"
     )
     version = str(run.get("splatctrl", ""))
-    # its values may mean something else
+    # values of a newer version may mean something else
     refuse_if(
         _numbers(version) > _numbers(__version__),
         f"{file}: written by splatctrl {version}, this is {__version__}",
@@ -206,7 +209,7 @@ def _states(columns: Mapping[str, tuple[str, ...]]) -> States:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchFolder:
-    """A batch and the last run of each node; jobs in the suite's order."""
+    """Batch and the last run of each node; jobs in the suite's order."""
 
     path: Path
     suite: str
@@ -214,7 +217,7 @@ class BatchFolder:
     runs: tuple[Run, ...]
 
     def inside(self, name: str) -> Path:
-        """Path the batch names. Raises InputError if it leaves the folder."""
+        """Path in the batch's folder. Raises InputError for a name that leads outside."""
         refuse_if(
             not name or Path(name).is_absolute() or ".." in Path(name).parts,
             f"{self.path / FILE}: {name!r}: expected a path in the batch",
@@ -228,7 +231,7 @@ def is_batch(path: Path) -> bool:
 
 
 def open_batch(path: Path) -> BatchFolder:
-    """Open a batch. Raises InputError for another or a too new file."""
+    """Open a batch. Raises InputError for another kind of file, or a newer version."""
     file = path / FILE
     batch = read_object(file)
     try:

@@ -22,15 +22,15 @@ from splatctrl_cli.recording.source_options import SourceOptions
 from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
 
 Mask = Callable[[RgbdFrame], Bool | None]
-"""A frame -> the pixels (H, W) that the mask rule selects."""
+"""Function of a frame to the pixels (H, W) that the mask rule selects, or None."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
     """Recording `where` with all its cameras, to score against.
 
-    scan: name in a data set. mask_rule: describes `mask`. Without depth, what training cameras saw is unknown.
-    stamps_ns: by camera, for a session of logs.
+    scan: its name in the data set. mask_rule: describes `mask`. Without depth, it is unknown what training cameras
+    saw. stamps_ns: by camera, for a session of logs.
     """
 
     where: Path
@@ -53,7 +53,7 @@ class Reference:
 
 
 def open_reference(recording: RecordingRequest, progress: Progress) -> Reference:
-    """Open the recording with all cameras: chosen ones are scored, others tell what was seen."""
+    """Open the recording with all cameras; those not scored show what was seen."""
     if recording.is_dtu:
         return _dtu_reference(recording, progress)
     refuse_scan_options(recording)
@@ -110,7 +110,7 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
 
 
 def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> Iterator[str]:
-    """Sentences on a scan's missing views that change the score, or lack depth."""
+    """Sentences on missing views that change the score, and on missing depth."""
     numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
     missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
     if missing and protocol is not None and protocol.every:
@@ -135,7 +135,7 @@ def _mask_of(source: DtuSource, wanted: str) -> tuple[Mask | None, str]:
 def cameras_to_score(
     wanted: Sequence[str] | None, reference: Reference, training: Sequence[str], *, allow_training: bool
 ) -> tuple[str, ...]:
-    """Scored cameras, by default those that did not train. Raises UsageError without any."""
+    """Scored cameras, by default those that did not train. Raises UsageError without a camera."""
     recorded = reference.source.cameras
     if reference.scores_training:
         return recorded
@@ -163,7 +163,7 @@ def cameras_to_score(
 
 
 def check_times(reference: Reference, scoring: Sequence[str], training: Sequence[str]) -> None:
-    """Raise InputError for a session's camera entirely before or after the training cameras."""
+    """Raise InputError if all frames of a scored camera precede or follow the training frames."""
     trained = [stamp for camera in training for stamp in reference.stamps_ns.get(camera, ())]
     for camera in scoring if trained else ():
         stamps = reference.stamps_ns[camera]
@@ -192,9 +192,10 @@ def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None
 def recording_check(
     path: Path, scene: SceneFolder, reference: Reference, digests: Mapping[str, str], *, allow_other: bool
 ) -> dict[str, Any]:
-    """Compare the recording with the scene's own; raises InputError for another, unless allowed.
+    """Compare the recording with that of the scene.
 
-    Compares training cameras' first frames, if kept, and digests of equal file names.
+    Compares training cameras' first frames, if kept, and digests of files with equal names. Raises InputError for
+    differences, unless `allow_other`.
     """
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})

@@ -1,4 +1,4 @@
-"""A score of scenes against held-out views of one or several scans."""
+"""Score of scenes against held-out views of one or several scans."""
 
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -42,11 +42,11 @@ from splatctrl_cli.report.pictures import comparison_picture, view_picture
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRequest:
-    """One scene, or a folder of scenes named like scans, to score on views.
+    """Scene, or a folder of scenes named like scans, to score on views.
 
-    recording: its options' cameras are scored. baseline: score.json of an earlier score. newest: render from the
-    newest snapshot not later than a view, else the final splats. images: of ``all`` views, each camera's
-    ``best-worst``, or ``none``. Raises UsageError for ``all`` without `out`.
+    recording: the cameras in its options are scored. baseline: score.json of an earlier score. newest: render the
+    newest snapshot up to a view, else the final splats. images: ``all`` views, each camera's ``best-worst``, or
+    ``none``. Raises UsageError for ``all`` without `out`.
     """
 
     scene: Path
@@ -74,10 +74,10 @@ class ScoreRequest:
 def score(request: ScoreRequest, progress: Progress = SILENT) -> JudgedResult:
     """Score a scene, or scenes of several scans and their mean. Raises SplatCtrlError.
 
-    Document: the content of ``score.json``.
+    Document: ``score.json``.
     """
     if request.baseline is not None:
-        read_baseline(request.baseline)  # refuses it before the views are scored
+        read_baseline(request.baseline)  # refuse a bad baseline before the views are scored
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
@@ -245,7 +245,7 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """Scenes by scan in a folder of them; empty for a single scene."""
+    """Scenes by scan in a folder of scenes; empty for a single scene."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
@@ -264,7 +264,7 @@ def _score_scans(
     results: dict[str, JudgedResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
-        # gates and baseline apply to the means alone
+        # gates and baseline apply only to the means
         alone = replace(
             request, scene=scene, recording=select_scan(request.recording, scan), require=(), baseline=None
         )
@@ -286,7 +286,7 @@ def _score_scans(
 def select_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
     """Recording of one scan with its masks in DIR/SCAN.
 
-    Raises InputError without them: masks of one scan fit no other.
+    Raises InputError without that folder: masks of one scan fit no other.
     """
     masks = None if recording.masks is None else recording.masks / scan
     refuse_if(

@@ -30,15 +30,15 @@ from splatctrl_cli.report.pictures import ComparisonRow
 from splatctrl_cli.scene.render import Color, Rendering, render, render_gaussians
 
 Ranked = tuple[float, ComparisonRow]
-"""PSNR [dB] over what was seen, or over all, and the view."""
+"""PSNR [dB] over seen pixels, else over all, and the view's pictures."""
 
 
 @dataclass(kw_only=True)
 class Scorer:
     """Scorer of views of `reference`; `draw` gets every view's row of pictures.
 
-    newest: as in `ScoreRequest`. Filled by `run`: views, their figures and sizes [px]; skipped: names before the
-    first snapshot; extremes: best and worst by camera; training: frames known at the last view; doubts.
+    newest: as in `ScoreRequest`. `run` fills the other fields. sizes: of views [px]. skipped: views before the first
+    snapshot. extremes: best and worst view by camera. training: training frames known at the last view.
     """
 
     scene: SceneFolder
@@ -65,7 +65,7 @@ class Scorer:
         scene, has_clock = self.scene, self.has_clock
         off = scene.run.get("metrics", {}).get("displaced_cameras") or {}
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
-        splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))  # read once for its views
+        splats_at = lru_cache(maxsize=1)(partial(splats_and_shell, scene))  # each snapshot is read once
         views = views_to_score(
             self.reference.source,
             scoring=self.cameras,
@@ -179,7 +179,7 @@ def render_with_shell(
     background: Color,
     threads: int,
 ) -> tuple[Rendering, Float32]:
-    """Render splats before a background; their depth (H, W) [m] is without the shell."""
+    """Render splats and shell before a background; depth (H, W) [m] excludes the shell."""
     camera = intrinsics, T_world_camera
     rendering = render_splats(splats, *camera, threads)
     depth = rendering.normalised_depth()
@@ -210,8 +210,9 @@ def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
 class CloudSettings:
     """Reference points or mesh at `path`, or a folder of them by scan.
 
-    unit: metres per unit of the file. Points beyond `max_distance` [m] count in a share, not in a mean. Both sides
-    are thinned to `spacing` [m]. masks: DTU's folder of observed space, for `space`.
+    unit: metres per unit of the file. Points farther than `max_distance` [m] from the other surface count in a share,
+    not in a mean. Both surfaces are thinned to `spacing` [m]. masks: DTU's folder of observed space, read into
+    `space`.
     """
 
     path: Path
@@ -237,7 +238,7 @@ class CloudSettings:
 def cloud_figures(
     settings: CloudSettings, scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int
 ) -> dict[str, float]:
-    """Surface figures by flat name, seen from training views `frames`."""
+    """Figures by name of the surface seen from training views `frames`."""
     reference, space, counts = space_out(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
     if space is not None:
@@ -262,7 +263,7 @@ def _reference(settings: CloudSettings) -> Float64:
 
 
 def _surface(scene: SceneFolder, frames: Sequence[RgbdFrame], threads: int, spacing: float) -> Float64:
-    """World points (P, 3) [m] of the final depth at `frames`, without robot, `spacing` apart."""
+    """World points (P, 3) [m] of depth rendered at `frames` without robot, `spacing` apart."""
     splats = final_splats(scene)
     splats = splats.select(splats.labels != Label.ROBOT)
     shown = (render_splats(splats, frame.intrinsics, frame.T_world_camera, threads) for frame in frames)

@@ -39,11 +39,11 @@ from splatctrl_cli.simulate.truth import Truth, distance_along, truth_document
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRequest:
-    """One simulation into the folder `out`: log.mcap, truth.json and robot files; dtu: a scan, too.
+    """Simulation into the folder `out`: log.mcap, truth.json and robot files.
 
-    urdf: of another arm, its base at the world's origin. spheres: None to fit them. is_slim: images show shapes
-    inside the collision shapes. unmodelled: `UNMODELLED` parts, in images and truth alone. scene: objects and motion
-    in place of the options' table.
+    urdf: another arm, with its base at the world's origin. spheres: None to fit them. is_slim: images show shapes
+    inside the collision shapes. unmodelled: `UNMODELLED` parts that only images and truth contain. scene: objects and
+    motion instead of the table of `options`. dtu: write a scan, too.
     """
 
     out: Path = Path("simulated")
@@ -78,7 +78,7 @@ class SimulateRequest:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SimulateResult(Result):
-    """The folder and the log's truth; document: also bytes by file or folder."""
+    """Folder and the log's truth; the document adds bytes by file or folder."""
 
     truth: Truth
 
@@ -185,7 +185,7 @@ def _sizes(folder: Path) -> dict[str, int]:
     }
 
 
-LATE = 1e3  # [rad/s] a second longer than its time costs as much: every way in time is better
+LATE = 1e3  # [rad/s] cost of a second's delay, so large that every way without delay is better
 REMEDY = "give the URDF of an arm whose base stands on the table's top"
 
 
@@ -194,7 +194,7 @@ def copy_arm(
 ) -> tuple[RobotModel, SelfSurfaces]:
     """Copy ``robot.urdf``, its ``meshes/`` and ``robot_spheres.yaml`` into a folder and read them.
 
-    Spheres are `sphere_file`, or fitted. Raises InputError without collision geometry or meshes.
+    Spheres are from `sphere_file`, or fitted. Raises InputError without collision geometry or meshes.
     """
     original = read_urdf(urdf)
     solids = read_solids(original, packages)
@@ -216,9 +216,10 @@ def copy_arm(
 def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
     """Adapt the scene's motion to another arm, whose tip follows the simulated arm's hand.
 
-    The tip is the URDF's last link, its z pointing away from the arm. It goes as far as it reaches, turned any way
-    about z, by the shortest clear way, or the least slowed one if none keeps the velocity limits. An arm that fits
-    the original postures keeps the motion. Raises InputError for an unreachable waypoint, or if every way collides.
+    The tip is the URDF's last link, its z pointing away from the arm. It may turn about z, and stay nearer to the
+    base if out of reach. The way is the shortest clear one, or, if none keeps the velocity limits, the least slowed.
+    An arm that fits the original postures keeps the motion. Raises InputError for an unreachable waypoint, or if
+    every way collides.
     """
     times, ours = scene.motion.times, scene.motion.waypoints
     if ours.shape[1] == model.num_joints and all(
@@ -244,7 +245,7 @@ def adapt_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Mot
 
 
 def _copy_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path, progress: Progress) -> str:
-    """Copy a URDF's meshes, visual ones as STL; return its text, without unreadable visual ones."""
+    """Copy a URDF's meshes, visual ones as STL; return its text without unreadable visual meshes."""
     root, copies = ElementTree.fromstring(urdf.text), dict[tuple[str, str], str]()
     parts = [(link, part) for link in root.iter("link") for tag in ("collision", "visual") for part in link.iter(tag)]
     for link, part in parts:
@@ -307,7 +308,7 @@ def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
 
 
 def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
-    """Yield poses about z, `nearer` times as far from the base axis."""
+    """Yield poses turned about z, at `nearer` times the distance from the base axis."""
     for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
         T = T_base_hand.copy()
         c, s = np.cos(angle), np.sin(angle)
@@ -317,7 +318,7 @@ def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
 
 
 def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
-    """Cost of a leg: length [rad], more if close or slowed; infinite in collision."""
+    """Cost of a leg: length [rad], more if close to surfaces or slowed; infinite in collision."""
     slowed = leg.within(model.velocity_limit)
     is_late = slowed.times[-1] > leg.times[-1]
     if is_late and any(primitive.track is not None for primitive in scene.primitives):

@@ -1,4 +1,4 @@
-"""Keys that a sweep may vary, and a run's jobs with their values."""
+"""Keys that a sweep may vary, and a run's jobs with varied values."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -23,9 +23,9 @@ PLACES = ("obstacle-x", "obstacle-y", "obstacle-radius")  # in the order of simu
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """A varied value: its unit, and the option of each command that takes it.
+    """Varied value: its unit, and the option of each command that takes it.
 
-    lockstep: options for a run that makes its own map. is_monotone: the verdict can turn only once.
+    lockstep: options for a run that makes its own map. is_monotone: the verdict can change only once.
     """
 
     name: str
@@ -64,7 +64,7 @@ KEYS = {
 
 
 def key_of(name: str) -> Key:
-    """A key by name, or a numeric setting ``SECTION.KEY``. Raises UsageError for others."""
+    """Key by name, or a numeric setting ``SECTION.KEY``. Raises UsageError for other names."""
     if name in KEYS:
         return KEYS[name]
     section, _, setting = name.partition(".")
@@ -83,14 +83,14 @@ def key_of(name: str) -> Key:
 
 @dataclass(frozen=True, kw_only=True)
 class Stage(Job):
-    """A command of a run, with its training cameras."""
+    """Command of a run, with its training cameras."""
 
     cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Commands of a run from the first that a key changes to the replay."""
+    """Commands of a run, from the first that a key changes up to the replay."""
 
     stages: tuple[Stage, ...]
     keys: Mapping[str, Key]
@@ -113,7 +113,7 @@ class Chain:
 
 
 def chain_of(run: RunFolder, keys: Mapping[str, Key], command_line: CommandLine) -> Chain:
-    """Commands behind a replay, as far back as the keys reach.
+    """Commands that made a replay, from the first that the keys change.
 
     Raises InputError for moved or changed inputs, UsageError for a key without effect.
     """

@@ -16,10 +16,10 @@ P = TypeVar("P")
 
 @dataclass(frozen=True, kw_only=True)
 class Flip(Generic[P]):
-    """The flip nearest to the start: last point before it, first after; None without one.
+    """Change of outcome nearest to the start, between the points `last` and `first`.
 
-    tried: by distance from the start. is_monotone: at most one change. spacing: largest gap tried before the flip (or
-    anywhere).
+    last, first: None without a flip. tried: points by distance from the start. is_monotone: at most one flip was
+    found. spacing: largest gap tried before the flip (without one, anywhere).
     """
 
     start: P
@@ -40,10 +40,11 @@ def find_flip(
     is_whole: bool = False,
     is_monotone: bool = False,
 ) -> Flip[float]:
-    """Find the flip nearest to `start` within `tolerance` (1 for whole values).
+    """Find the flip nearest to `start`, to within `tolerance` (1 for whole values).
 
-    judge: outcomes of values, in parallel. It tries the ends and SWEEP_SAMPLES values between; SWEEP_SEARCHED if the
-    outcome may turn back, or does. Then it bisects the nearest pair with different outcomes.
+    judge: outcomes of several values, in parallel. It tries the ends and SWEEP_SAMPLES values between, or
+    SWEEP_SEARCHED if the outcome may or does change more than once. Then it bisects the nearest pair with different
+    outcomes.
     """
     known: dict[float, str] = {}
 
@@ -51,7 +52,7 @@ def find_flip(
         return float(round(value)) if is_whole else float(f"{value:.6g}")
 
     def tried(values: Sequence[float]) -> list[float]:
-        """Try what is new; return all values by their distance from the start."""
+        """Try new values; return all tried values by distance from the start."""
         new = [value for value in dict.fromkeys(values) if value not in known]
         known.update(zip(new, judge(new), strict=True) if new else ())
         return sorted(known, key=lambda value: abs(value - start))
@@ -84,7 +85,7 @@ def find_flip(
 class LeastChange(Generic[P]):
     """Points before and after a flip along one direction.
 
-    length: root of summed squares of the range shares of `first`.
+    length: Euclidean norm of `first`, in shares of the ranges.
     """
 
     length: float
@@ -104,9 +105,10 @@ def find_least(
 ) -> LeastChange[Shares] | None:
     """Find the shortest joint change that flips the outcome of (0, ..., 0), or None.
 
-    Points lie in the unit cube. alone: the share at which each value flips it alone. It tries the diagonal and
-    SWEEP_DIRECTIONS of Halton's sequence, then turns the best by a quarter and an eighth towards and away from each
-    value. Each is tried at the best length, and bisected to `tolerance` if it flips.
+    Points lie in the unit cube. alone: share at which each value alone flips the outcome, or None. It tries the
+    diagonal and SWEEP_DIRECTIONS of Halton's sequence. Then it turns the best direction by a quarter and an eighth
+    towards and away from each axis. Each direction is tried at the best length, and bisected to `tolerance` if it
+    flips.
     """
     num = len(alone)
     start = judge([(0.0,) * num])[0]

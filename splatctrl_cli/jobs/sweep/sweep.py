@@ -31,10 +31,10 @@ REFUSED, BY_ITS_VALUES = "refused", (2, 4)  # an outcome, and the exit codes it 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
-    """Repeat a replay over ranges KEY=A:B.
+    """Repetitions of a replay over ranges KEY=A:B.
 
-    tolerance: distance of a flip's sides, as a share of the range. out: may be continued. workers: parallel runs.
-    dask: address of a scheduler instead.
+    tolerance: distance of a flip's two sides, as a share of the range. out: an earlier sweep there is continued.
+    workers: number of parallel runs. dask: address of a Dask scheduler.
     """
 
     replay: Path
@@ -47,9 +47,9 @@ class SweepRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """A run of the sweep: values by key, its result, and folder.
+    """A run of the sweep: values by key, result, and folder.
 
-    outcome: of its verdict, or REFUSED if a command rejected the values or the changed recording.
+    outcome: of the verdict, or REFUSED if a command rejected the values or the changed recording.
     """
 
     values: Mapping[str, float]
@@ -83,7 +83,7 @@ class KeyFlip(Flip[Tried]):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SweepResult(Result):
-    """Content of ``sweep.json``; before: the run's own verdict."""
+    """Content of ``sweep.json``; before: verdict of the swept replay."""
 
     out: Path
     before: Mapping[str, Any]
@@ -195,7 +195,7 @@ def _check_same(out: Path, requested: Mapping[str, Any]) -> None:
 
 
 def ranges_of(over: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Ends by name of each ``KEY=A:B``. Raises UsageError for an invalid one."""
+    """Ends by name of each ``KEY=A:B``. Raises UsageError for an invalid range."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in over:
         name, _, span = text.partition("=")
@@ -253,7 +253,7 @@ class Runs:
         return nodes_of(self.suite(values), self.out, self.command_line)
 
     def at(self, points: Sequence[Mapping[str, float]]) -> list[Tried]:
-        """Make the run at points, in parallel. Raises InputError if one fails."""
+        """Make the runs at points, in parallel. Raises InputError if a run fails."""
         new = {tuple(point.values()): point for point in points if tuple(point.values()) not in self.tried}
         new_nodes = {values: self.nodes_at(point) for values, point in new.items()}
         nodes: dict[str, Node] = {}
@@ -273,7 +273,7 @@ class Runs:
         return [self.tried[tuple(point.values())] for point in points]
 
     def _read_tried(self, values: Mapping[str, float], runs: Sequence[Run]) -> Tried:
-        """Raise InputError if a run failed for another cause than its values."""
+        """Read a run's result. Raises InputError if it failed for another cause than its values."""
         last, unknown = runs[-1], str(Outcome.NOT_EVALUABLE)
         tried = partial(Tried, values=dict(values))
         if not last.outcome and last.exit_code == EXIT_CODES[Outcome.NOT_EVALUABLE]:
