@@ -222,7 +222,6 @@ def _positive(covariance: Float64) -> Float64:
 
 
 def _find_noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
-    """`CalibratedCamera.depth_noticed` by camera."""
     unknowns = tried.adjustment.unknowns
     columns = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
     noticed = {}

@@ -222,7 +222,6 @@ def class_command(target: str) -> tuple[str, ...]:
 
 
 def _start(model: RobotModel, config: ControlConfig, frame: str, home: Float64) -> Document:
-    """First line; see `ControllerStart`."""
     return {
         "protocol": PROTOCOL,
         "joints": list(model.joint_names),
@@ -238,7 +237,6 @@ def _start(model: RobotModel, config: ControlConfig, frame: str, home: Float64) 
 
 
 def _question(model: RobotModel, frame: str, moment: Moment, view: View) -> Document:
-    """Line of a step; see `ControllerInput`."""
     guide = moment.guide
     return {
         "stamp_ns": moment.stamp_ns,

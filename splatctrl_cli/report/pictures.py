@@ -255,7 +255,6 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
 
 def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int, int], viewer: Float64) -> None:
-    """Triangles from far to near, lit from the viewer."""
     order = np.argsort(triangles.mean(axis=1) @ viewer, kind="stable")
     seen = triangles[order]
     normal = face_normals(seen)

@@ -25,11 +25,8 @@ EDGE = 0.5  # [px] of disparity between neighbours that are no longer one surfac
 class StereoDepth:
     """Depth measured by two imagers, in the image of a colour camera.
 
-    A depth pixel is a pixel of the imagers.
-
-    - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m
-      and 14.5 mm at 2 m. Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Disparity steps are
-      1/32 px.
+    - Disparity d = f b / z errs by `spread` [px], so depth errs by z^2 spread / (f b): with 0.07 px, 3.6 mm at 1 m.
+      Errors r depth pixels apart correlate by exp(-(r / `window`)^2). Disparity steps are 1/32 px.
     - Next to an edge of 0.5 px or more, the background takes the foreground's depth over `fattening` depth pixels.
       The width is uniform between the two numbers, and constant within a window.
     - Background that the second imager does not see is lost: f b (1 / z_foreground - 1 / z_background) depth pixels

@@ -1,18 +1,14 @@
 """Baked grids for other planners: NVIDIA's cuRobo and MoveIt.
 
-cuRobo's voxel grid is ``field.curobo.npz``, by its source (NVlabs/curobo, 0.7.5 to 0.7.7, not 0.7.0 to 0.7.4:
-geom/types.py `VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested. (x, y, z) is flattened
-with z fastest; the middle's pose is ``x y z qw qx qy qz``. Values are positive inside; there are
-``1 + floor(dims / voxel)`` cells a side.
+cuRobo's voxel grid is ``field.curobo.npz``, after its source (NVlabs/curobo, 0.7.5 to 0.7.7, geom/types.py
+`VoxelGrid`, curobolib/cpp/sphere_obb_kernel.cu `compute_voxel_index`), untested. z runs fastest; values are positive
+inside; there are ``1 + floor(dims / voxel)`` cells a side. The kernel truncates ``(x - pose + dims / 2) / voxel``, so
+the pose ``x y z qw qx qy qz`` is half a voxel below our cells' middle. The first three and last two cells of an axis,
+and the outside, are free.
 
-The kernel truncates ``(x - pose + dims / 2) / voxel``: cell i spans ``pose - dims / 2 + [i, i + 1] voxel``, so the
-pose is half a voxel below our cells' middle. A sphere reads its centre's cell. The first three and last two cells of
-an axis, and the outside, are free.
-
-MoveIt's distance field reads occupied cells: moveit_core, distance_field/src/propagation_distance_field.cpp
-(`readFromStream`; the same in MoveIt 1 and 2) and voxel_grid.h. Seven lines of text precede a zlib stream of bits: x
-slowest, each run of z in whole bytes, lowest bit first. There are ``int(size * (1 / resolution))`` cells a side; cell
-0 is centred at the origin.
+MoveIt's distance field reads occupied cells (moveit_core, distance_field/src/propagation_distance_field.cpp,
+`readFromStream`; voxel_grid.h). Seven lines of text precede a zlib stream of bits: x slowest, each run of z in whole
+bytes, lowest bit first. There are ``int(size * (1 / resolution))`` cells a side; cell 0 is centred at the origin.
 """
 
 import json

@@ -1,14 +1,12 @@
 """The packed splat formats ``.splat`` and ``.spz``, in the world's axes.
 
-``.splat`` has 32 bytes per Gaussian, no header: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is
-1); a quaternion w x y z as 128 q + 128. It has no view-dependent colour, labels or comments.
+``.splat`` has 32 bytes per Gaussian: float32 centre and sigmas; bytes of red, green, blue, opacity (255 is 1); a
+quaternion w x y z as 128 q + 128.
 
 ``.spz`` (Niantic) is written in version 3, read in 2 to 4. A gzip stream has a header of 16 bytes, then by attribute
 centres (24-bit fixed point), opacities, colours, log sigmas, rotations, harmonics above degree 0. Version 4 has a
 plain header of 32 bytes, a table of two uint64 per attribute (bytes packed and unpacked), and a zstd stream for each.
-Empty harmonics may be left out.
-
-The axes of ``.spz`` are right, up, back; world axes are written unchanged, for reading back.
+Its axes are right, up, back; world axes are written unchanged, for reading back.
 """
 
 import gzip
@@ -184,7 +182,6 @@ def _columns(path: Path, content: bytes) -> tuple[int, list[UInt8]]:
 
 
 def _parse_head(path: Path, head: bytes, versions: tuple[int, ...], size: int) -> tuple[int, int, tuple[int, ...]]:
-    """Number of Gaussians, fraction bits, bytes per attribute."""
     refuse_if(
         len(head) < HEADER.size or HEADER.unpack_from(head)[0] != MAGIC,
         f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {head[:4].hex()}",

@@ -139,7 +139,6 @@ def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, re
 def _held_out_cameras(
     recording: RecordSource, request: BakeRequest, trained: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Named cameras, or all but known training cameras."""
     log, names, known = request.held_out, request.held_out_cameras, recording.cameras
     if wrong := [name for name in names if name not in known]:
         raise UsageError(f"--held-out: {log} has no camera {wrong[0]}", remedy=f"it has: {', '.join(known)}")

@@ -248,7 +248,6 @@ def _key(name: str) -> str:
 
 
 def _toml(value: object) -> str:
-    """Format a value with nine digits, as in ``steps.csv``."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):

@@ -295,7 +295,6 @@ def _is_enough(points: Path | TextIO) -> bool:
 
 
 def _grid_file(source: Path) -> Path | None:
-    """``field.npz`` of a field, None for a scene."""
     file = source if source.suffix == ".npz" and source.is_file() else source / "field.npz"
     refuse_if(
         not file.is_file() and (source / "field.json").is_file(),

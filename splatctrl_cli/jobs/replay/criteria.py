@@ -245,7 +245,6 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def _commanded(judged: Judged) -> Reason | None:
-    """Largest velocity commanded, as a share of its limit."""
     replay = judged.replay
     if replay.outside is None:
         return None

@@ -79,7 +79,6 @@ def add_separation(declared: DeclaredSeparation, inputs: ReplayInputs, replay: R
 
 
 def _person_inputs(declared: DeclaredSeparation) -> Iterator[SeparationInput]:
-    """Definition of a person, and v_h."""
     is_assumed = declared.who == ANYTHING
     how = "every surface of the map counts" if is_assumed else f"surfaces that count: {declared.who}"
     yield SeparationInput(symbol="person", unit="", source=ASSUMED if is_assumed else DECLARED, how=how)
@@ -101,7 +100,6 @@ def _number(
 
 
 def _time_inputs(declared: DeclaredSeparation, inputs: ReplayInputs) -> Iterator[SeparationInput]:
-    """T_r and the account of a stop."""
     scene = inputs.scene
     if declared.reaction_time is None:
         refuse_if(
@@ -132,7 +130,6 @@ def _time_inputs(declared: DeclaredSeparation, inputs: ReplayInputs) -> Iterator
 
 
 def _distance_inputs(declared: DeclaredSeparation, inputs: ReplayInputs, replay: Replay) -> Iterator[SeparationInput]:
-    """Constant parts of Z_d and Z_r."""
     figures, map_error = inputs.scene.figures(), replay.map_error
     if declared.map_error is None and map_error is not None and map_error.bound is not None:
         how = f"bound on the map's error, {100 * map_error.bound.confidence:.3g} % confidence; plus v_h times the age"
@@ -284,7 +281,6 @@ class _Balls:
 def _clearances(
     robot: RobotModel, q: Float64, balls: _Balls | None, centers: Float64 | None = None
 ) -> tuple[Float64, Bool]:
-    """Return `part_clearances`, infinite without balls."""
     if balls is None:
         num = int(np.count_nonzero(robot.moving_spheres))
         return np.full((len(q), num), np.inf), np.ones(num, bool)

@@ -68,7 +68,6 @@ def _blame_end(judged: Judged, reasons: Iterable[Reason]) -> Iterator[Reason]:
 
 
 def _oldest_map(judged: Judged) -> Reason | None:
-    """The oldest map, and the interval about it."""
     trace = judged.replay.trace
     ages = trace["map_age_s"]
     oldest = worst_state(trace, ages, np.nanargmax)

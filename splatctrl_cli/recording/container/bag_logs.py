@@ -157,7 +157,6 @@ class Bag1Log(RawLog):
         return Part(offset, kind, body, is_cut, fields)
 
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
-        """Read a head, up to the body."""
         length = self._length(stream)
         if length is None or length > min(1 << 20, self._size - stream.tell()):  # those of connections hold a name
             return None

@@ -300,7 +300,6 @@ class _Walk:
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """The footer before the closing mark."""
     if size < 2 * len(MAGIC) + _FOOTER_SIZE:
         return None
     stream.seek(size - len(MAGIC) - _FOOTER_SIZE)

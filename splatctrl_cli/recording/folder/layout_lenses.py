@@ -1,19 +1,16 @@
 """Layouts with a lens per image: ARKitScenes, BOP scenes, and MVSNet scenes.
 
-ARKitScenes: ``lowres_wide/``, ``lowres_depth/``, ``lowres_wide_intrinsics/``, ``lowres_wide.traj``. Images are named
-by video and seconds; depth is in millimetres; an image's ``.pincam`` has width, height, fx, fy, cx, cy. Trajectory
-lines are seconds, rotation vector, translation [m], world to camera, interpolated like tf (apple/ARKitScenes,
-DATA.md, and threedod/benchmark_scripts/utils/tenFpsDataLoader.py).
+ARKitScenes (apple/ARKitScenes, DATA.md, threedod/benchmark_scripts/utils/tenFpsDataLoader.py): images are named by
+video and seconds; depth is in millimetres; a ``.pincam`` has width, height, fx, fy, cx, cy. Lines of
+``lowres_wide.traj`` are seconds, rotation vector, translation [m], world to camera, interpolated like tf.
 
-BOP: ``scene_camera.json``, ``rgb/`` (or ``gray/``), ``depth/``, in PNG, JPEG or TIFF. Per image: cam_K by rows [px],
-depth_scale (counts to millimetres), cam_R_w2c by rows, cam_t_w2c in millimetres (thodan/bop_toolkit,
-docs/bop_datasets_format.md). Several sensors: ``scene_camera_cam1.json``, ``rgb_cam1/``, ``depth_cam1/``.
+BOP (thodan/bop_toolkit, docs/bop_datasets_format.md): ``scene_camera.json`` has per image cam_K by rows [px],
+depth_scale (counts to millimetres), cam_R_w2c by rows, cam_t_w2c in millimetres.
 
 MVSNet: ``cams/NUMBER_cam.txt``, ``pair.txt``, images, optional depth (.pfm). A camera file is the world-to-camera
 matrix, K, and ``DEPTH_MIN DEPTH_INTERVAL [DEPTH_NUM [DEPTH_MAX]]`` (README, "File Formats") or ``DEPTH_MIN
-DEPTH_MAX``. Images: ``images/`` (DTU's test set, Tanks and Temples, ETH3D, colmap2mvsnet.py), ``blended_images/``
-(BlendedMVS) or next to ``cams/``. Depth, in the cameras' unknown unit: ``rendered_depth_maps/`` (BlendedMVS) or any
-folder with ``depth`` in its name.
+DEPTH_MAX``. Images: ``images/``, ``blended_images/`` (BlendedMVS) or next to ``cams/``. Depth, in the cameras'
+unknown unit: any folder with ``depth`` in its name.
 """
 
 import re

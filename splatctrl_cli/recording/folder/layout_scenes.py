@@ -1,18 +1,16 @@
 """Room scenes with a trajectory or a pose per frame: 7-Scenes, Open3D, Redwood, Replica.
 
 7-Scenes and its kin: ``frame-NNNNNN.color.*``, ``.depth.*``, ``.pose.txt``, in one folder, ``seq-NN/``, ``data/``.
-Depth is in millimetres, 65535 = none; poses are camera to world. Three calibrations:
+Depth is in millimetres, 65535 = none; poses are camera to world. Calibrations:
 
-- ``info.txt`` of ScanNet's SensReader (12-Scenes, BundleFusion, 3RScan): the user describes the folder;
+- ``info.txt`` of ScanNet's SensReader: the user describes the folder;
 - ``camera-intrinsics.txt``, one 3x3 matrix for colour and depth (3DMatch, Zeng et al., CVPR 2017);
-- none: 7-Scenes publishes the depth camera's intrinsics 585, 585, 320, 240 and poses; colour is not registered
-  (Shotton et al., CVPR 2013, and the dataset's page). Colour gets a Kinect's focal length 525, and its pose from
-  another Kinect's calibration, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py, after LIRIS' calibration).
+- none: 7-Scenes publishes intrinsics and poses of the depth camera; colour is not registered (Shotton et al., CVPR
+  2013). Colour's lens and pose are another Kinect's, as in ACE (nianticlabs/ace, datasets/setup_7scenes.py).
 
 Open3D and Redwood: a colour folder, ``depth/``, ``trajectory.log``, ``camera_intrinsic.json``, named as in
-open3d.data (RedwoodIndoorLivingRoom1 with ``colors/``, LoungeRGBDImages, BedroomRGBDImages). Poses are camera to
-world (examples/python/reconstruction_system/integrate_scene.py). Images match poses in natural order
-(open3d_example.py, get_rgbd_file_lists), or by number if their counts differ.
+open3d.data. Poses are camera to world (examples/python/reconstruction_system/integrate_scene.py). Images match poses
+in natural order (open3d_example.py, get_rgbd_file_lists), or by number if their counts differ.
 """
 
 import re

@@ -1,12 +1,9 @@
 """Layouts with images paired by stamp: TUM RGB-D and its kin, and SUN3D.
 
 TUM RGB-D: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``. Depth counts 1/5000 m, registered to raw colour; poses are
-the colour camera's. Files, factor and cameras: the dataset's page (Sturm et al., IROS 2012; the same in
-raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml).
-
-Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and T_camera = T_ros^-1 T_groundtruth T_ros
-T_m from groundtruth.txt's marker frame. T_m's rotation has a scale of 1.059, which is dropped. ETH3D SLAM (Schöps et
-al., CVPR 2019) has ``calibration.txt`` with fx, fy, cx, cy.
+the colour camera's (the dataset's page; Sturm et al., IROS 2012). Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019):
+T_camera = T_ros^-1 T_groundtruth T_ros T_m, of its page, without the scale of 1.059 in T_m's rotation. ETH3D SLAM
+(Schöps et al., CVPR 2019) has ``calibration.txt`` with fx, fy, cx, cy.
 
 SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``, as
 in its reader (SUN3DreaderWithAnnotation, readSUN3Dannotation.m). Depth is in millimetres with bits rotated left by

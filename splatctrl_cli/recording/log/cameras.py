@@ -109,7 +109,6 @@ def _camera(
 
 
 def _family(name: str) -> tuple[str, ...]:
-    """Topic parts that a sensor's image topics share."""
     parts = _parts(name)
     return (*parts[:-1], re.sub("_?(rect|raw)", "", parts[-1]))
 

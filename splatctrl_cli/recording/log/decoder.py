@@ -195,7 +195,6 @@ def _foxglove_store() -> Any:
 
 
 def _kind(description: Any) -> object:
-    """A field's type without array, sequence and string lengths."""
     kind, detail = description
     return detail if kind == Nodetype.NAME else detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
 
