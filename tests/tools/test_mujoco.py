@@ -6,6 +6,7 @@ import ast
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -241,7 +242,15 @@ def test_a_log_of_each_format_is_read_by_the_tool(
             log.add_image(k / 10, camera, color, np.full((480, 640), 1234, np.uint16))
     assert main(["info", str(tmp_path / log_name(kind)), "--json"]) == 0
     said = capsys.readouterr().out
-    assert "camera_left" in said and "joint_states" in said
+    recipe = (
+        (Path(__file__).parents[2] / "docs" / "input.md")
+        .read_text()
+        .split("ros2 bag record", 1)[1]
+        .split("splatctrl", 1)[0]
+    )
+    topics = set(re.findall(r"/camera/left/\S+", recipe))
+    assert len(topics) == 3 and all(topic.replace("/left/", "/camera_left/") in said for topic in topics)
+    assert "joint_states" in said
 
 
 def test_a_recording_is_whole_and_the_same_twice(
