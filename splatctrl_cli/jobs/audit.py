@@ -153,7 +153,6 @@ def audit(request: AuditRequest, progress: Progress = SILENT) -> JudgedResult:
 
 
 def _digests(request: AuditRequest, urdf: UrdfFile | None) -> dict[str, str]:
-    """sha256 of the given spheres, and of the robot's text and meshes."""
     digests = {} if request.spheres is None else {request.spheres.name: sha256(request.spheres)}
     if urdf is None:
         return digests

@@ -157,7 +157,6 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
 
 
 def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
-    """Simultaneous frames of each camera, without colour, and board sightings."""
     stamps = stamps_by_camera(source)
     chosen = frames_nearest(stamps, spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES))
     frames: list[RgbdFrame] = []

@@ -105,7 +105,6 @@ def _frames(log: Path, cameras: Sequence[str] | None, until_ns: int) -> Iterator
 
 
 def _compare_with_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request: BakeRequest) -> dict[str, Any]:
-    """Compare with the newest held-out depth up to the scene's stamp."""
     recording = open_source(log)
     cameras = _held_out_cameras(recording, request, source.cameras)
     newest: dict[str, tuple[RgbdFrame, JointState | None]] = {}

@@ -287,7 +287,6 @@ def _judge(scale: Scale, before: float, after: float | None) -> tuple[Change, fl
 
 
 def _job_changes(figure_changes: Sequence[FigureChange]) -> Iterator[JobChange]:
-    """Changes of figures over enough recordings, judged by mean and confidence interval."""
     by_job: dict[tuple[str, str], list[FigureChange]] = {}
     for one in figure_changes:
         if one.better is not Better.NEITHER and one.after is not None:

@@ -176,7 +176,6 @@ def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
-    """Difference of a scene's robot from a model in words, or empty text."""
     joints = made_from.get("robot_joints")
     if joints is None:
         return ""

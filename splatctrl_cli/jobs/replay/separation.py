@@ -333,7 +333,6 @@ def unseen_cells(seen: Seen) -> Float64:
 
 
 def _figures(replay: Replay, metrics: Metrics) -> dict[str, float | None]:
-    """Values of `FIGURES`, None without a person or static surface."""
     below, scale = replay.trace["below_s"], replay.trace["speed_scale"]
     own = metrics | {"standstill_below_s": float(below[scale <= 0].sum())}
     return {name: own[name] for name in FIGURES}

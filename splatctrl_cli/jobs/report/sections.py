@@ -77,7 +77,6 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
 
 
 def _separation(run: RunFolder) -> list[Table]:
-    """Tables of the protective separation distance and its inputs; none without ``separation.json``."""
     separation = run.json_of("separation.json")
     if separation is None:
         return []

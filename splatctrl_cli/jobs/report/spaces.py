@@ -203,7 +203,6 @@ def spread(times: list[float], when: float) -> list[int]:
 
 
 def _add_seen(space: Space, known: SceneFolder | Snapshot | None, scene: SceneFolder) -> Space:
-    """Add cameras at their first poses, and space without evidence by class."""
     space = replace(space, cameras=[_camera(row) for row in scene.made_from.get("first_frames", [])])
     seen = None if known is None else known.seen()
     if seen is None:

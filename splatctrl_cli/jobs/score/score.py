@@ -245,7 +245,6 @@ def _write_result(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """Scenes by scan in a folder of scenes; empty for a single scene."""
     folder, recording = request.scene, request.recording
     if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}

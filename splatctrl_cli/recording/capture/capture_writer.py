@@ -188,7 +188,6 @@ def _write_index(
 
 
 def _write_sums(path: Path, journal: Journal, others: Mapping[str, str]) -> None:
-    """Write sorted lines, reading the journal once per image folder to bound memory."""
     written = (name for entry in journal.entries() for _, name in entry.sums if not name.startswith(LENSES))
     folders = {f"{name.rpartition('/')[0]}/" for name in written}
     with path.open("w", encoding="utf-8", newline="") as stream:
