@@ -13,7 +13,7 @@ from splatctrl_cli.simulate.arm import UNMODELLED, Block, Capsule, link_shape
 from splatctrl_cli.simulate.primitives import Primitive, signed_distance
 from splatctrl_cli.simulate.render import StereoDepth
 from splatctrl_cli.simulate.tabletop import arm_solids
-from tests.tools.test_hunt import START, beside, clearance_at_start, in_view, read, shown_of, world_of
+from tests.tools.test_hunt import START, ball_at_link, clearance_at_start, in_view, read, shown_of, world_of
 from tools.hunt.body import Body, draw_body
 from tools.hunt.clearance import TrueArm
 from tools.hunt.faults import Fault
@@ -31,7 +31,9 @@ def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("body", "clearance"), [(Body(), 0.004), (Body(is_slim=True), 0.007)])
 def test_the_clearance_is_that_of_what_is_seen_of_the_arm(model: RobotModel, body: Body, clearance: float) -> None:
-    target = beside(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm beside the collision shape of the palm
+    target = ball_at_link(
+        model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033
+    )  # 4 mm off the palm
     assert abs(clearance_at_start(TrueArm(model, body=body), target) - clearance) < 1e-6
 
 
@@ -39,7 +41,9 @@ def test_the_clearance_is_that_of_what_is_seen_of_the_arm(model: RobotModel, bod
 def test_an_unmodelled_part_counts(model: RobotModel, name: str) -> None:
     link, capsules = UNMODELLED[name]
     arms = (TrueArm(model, body=Body(is_slim=True, parts=parts)) for parts in ((name,), ()))
-    found, without = (clearance_at_start(arm, beside(model, link, *capsules[0].end, radius=0.001)) for arm in arms)
+    found, without = (
+        clearance_at_start(arm, ball_at_link(model, link, *capsules[0].end, radius=0.001)) for arm in arms
+    )
     assert found == pytest.approx(-0.001 - capsules[0].radius, abs=1e-6) and without > 0
 
 
