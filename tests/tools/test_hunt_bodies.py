@@ -31,9 +31,7 @@ def few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("body", "clearance"), [(Body(), 0.004), (Body(is_slim=True), 0.007)])
 def test_the_clearance_is_that_of_what_is_seen_of_the_arm(model: RobotModel, body: Body, clearance: float) -> None:
-    target = ball_at_link(
-        model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033
-    )  # 4 mm off the palm
+    target = ball_at_link(model, "hand", 0.025 + 0.05 + 0.004, 0.0, 0.033)  # 4 mm off the palm
     assert abs(clearance_at_start(TrueArm(model, body=body), target) - clearance) < 1e-6
 
 
