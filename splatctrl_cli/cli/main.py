@@ -71,7 +71,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
-    """Print an error on stderr (with --json on stdout); return line and exit code."""
+    """Print an error on stderr (with --json also on stdout); return line and exit code."""
     message, remedy, code = _explain(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
@@ -179,7 +179,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO would wait for its writer, /dev/zero fill the memory.
+    A FIFO would wait for its writer; /dev/zero would fill the memory.
     """
     sys.addaudithook(_look)
 
