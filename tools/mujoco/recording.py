@@ -1,4 +1,4 @@
-"""A recording from its seed and index: drawn, rendered, logged, and its truth written beside it."""
+"""A recording from its seed and index: drawn, rendered, logged, with a file of its truth."""
 
 import json
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Plan:
 
 
 def draw(seed: int, index: int) -> Plan:
-    """The recording of a seed and an index; the same for the same two. Families and robots come by turns."""
+    """The plan of a recording, determined by its seed and index. Families and robots take turns."""
     family = ORDER[index % len(ORDER)]
     robot = load_robot(list(ROBOTS)[(index + index // len(ORDER)) % len(ROBOTS)])
     rng = np.random.default_rng([seed, index])
@@ -156,7 +156,7 @@ def _log_state(robot: Robot, log: Log, time: float, q: Float64, velocity: Float6
 
 
 def _static_transforms(plan: Plan) -> list[Transform]:
-    """The robot's root in the world, and every camera where the log says it is."""
+    """Transforms of the robot's root in the world, and of every camera at its logged pose."""
     out: list[Transform] = [] if plan.stage.robot.root == "world" else [("world", plan.stage.robot.root, np.eye(4))]
     for camera in plan.stage.cameras:
         T = camera.T_parent_camera @ plan.stage.pose_errors.get(camera.name, np.eye(4))
