@@ -1,4 +1,4 @@
-"""A planned path, followed in closed loop: in joint space, or by the QP-IK controller with its barriers."""
+"""Follows a planned path in closed loop: in joint space, or by the QP-IK controller with its barriers."""
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise

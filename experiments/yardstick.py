@@ -105,7 +105,7 @@ class Yardstick:
 
 
 def proved_clearance(model: RobotModel, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
-    """What no moving sphere's distance [m] goes below, at the states and between them; NaN where one is missing.
+    """Lower bound [m] of all moving spheres' distances, at the states and between them; NaN if one is missing.
 
     certified_at gives at a stamp a lower bound of a 1-Lipschitz distance, the same object for the same scene. Half
     of the way to the next state and half of the way from the last one count by the scene of the state: over each, a
