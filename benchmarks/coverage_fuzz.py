@@ -1,9 +1,9 @@
 """`python -m benchmarks.coverage_fuzz --minutes N`: coverage-guided fuzzing of the readers, with atheris.
 
 atheris (PyPI, no dependency) instruments this program's Python and keeps the inputs that reach new code. Each reader
-of `benchmarks.readers` runs in a process of its own for its share of the time. A fault is an exception that the
-reader does not declare, an input that takes over 20 s, or a process that dies or grows beyond 2 GiB. A fault does not
-end the run; its input is kept.
+of `benchmarks.readers` runs in a process of its own for its share of the time. A fault is an undeclared exception, an
+input that takes over 20 s, or a process that dies or grows beyond 2 GiB. A fault does not end the run; its input is
+kept.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Errors of the Matern field after sphere marching, by shape and number of steps.
 
-Splats are 5 mm apart on a plane, and 1 cm apart on a box and a ball, without radii or as balls that touch the surface
-from inside. Points are 1 to 10 cm outside. Error is the root mean square of distance minus truth. `hard` is the exact
-distance to the splats.
+Splats are 5 mm apart on a plane, and 1 cm apart on a box and a ball. They have no radii, or are balls that touch the
+surface from inside. Points are 1 to 10 cm outside. Error is the root mean square of distance minus truth. `hard` is
+the exact distance to the splats.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
 """`python -m benchmarks.mcap_recovery`: messages read from damaged MCAP files, here and by MCAP's own tool.
 
-Each of four small logs (zstd, lz4, no compression, no chunks; checksums on) is damaged in five ways at many places:
-cut; one byte changed; 64 bytes of zeros; 64 bytes removed; eight bytes replaced by a large number. A message is right
-if the undamaged log contains it (topic, time and bytes). The tool is `mcap recover`, as `benchmarks.mcap_recover`
-implements it.
+Each of four small logs (zstd, lz4, no compression, no chunks; checksums on) is damaged in five ways at many places.
+The ways are: cut; one byte changed; 64 bytes of zeros; 64 bytes removed; eight bytes replaced by a large number. A
+message is right if the undamaged log contains it (topic, time and bytes). The tool is `mcap recover`, as
+`benchmarks.mcap_recover` implements it.
 """
 
 import argparse
@@ -41,7 +41,7 @@ LOGS: dict[str, tuple[CompressionType, bool]] = {
 @dataclass(frozen=True, kw_only=True)
 class Counted:
     """Numbers of right messages of one damaged file. read: here; copied, decoded: by the tool, copying and decoding;
-    lacking: kept by the tool but not read here; claimed: reported by the tool when copying.
+    lacking: kept by the tool but not read here. claimed: reported by the tool when copying.
     """
 
     read: int

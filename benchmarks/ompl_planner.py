@@ -27,8 +27,8 @@ MAX_TIME = 10.0  # [s]
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A path (W, J), CPU seconds to the first path and with OMPL's simplification, number of calls into Python, and
-    number of the path's edges that fine samples find in collision.
+    """A path (W, J), CPU seconds to the first path and with OMPL's simplification, and calls into Python. num_hit:
+    edges of the path that fine samples find in collision.
     """
 
     path: Float64

@@ -1,7 +1,7 @@
 """The optimiser iteration of `iteration.py` in plain torch operations on the CPU, with autograd: the reference.
 
 The same equations, tiles of 16 pixels and constants as the compiled kernels. Tile lists are padded to the longest
-list in a row of tiles, and the row is blended at once, because plain torch has no such kernel.
+list in a row of tiles. The row is then blended at once, because plain torch has no such kernel.
 """
 
 import numpy as np

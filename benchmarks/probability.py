@@ -1,6 +1,6 @@
 """Reliability of the two probabilities of collision, on solids with exact distance.
 
-Box, ball and a table with objects are covered by balls 1 and 2 cm apart that touch the surface from inside; noise of
+Box, ball and a table with objects are covered by balls 1 and 2 cm apart that touch the surface from inside. Noise of
 2 mm then moves their centres. Points are uniform in space from 5 mm inside to 5 cm outside. A point inside the solid
 collides. The calibrated form has the default `field.error_mean` and `field.error`, which were measured here: the mean
 error of the distance up to 1 cm outside, and its standard deviation. The closed meshes below SPLATCTRL_REAL_DATA were

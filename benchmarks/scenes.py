@@ -35,8 +35,8 @@ class FitProblem:
 
 
 def wall_problem(num_splats: int) -> FitProblem:
-    """A wall of random splats that fills a 640x480 view: radii are 0.95 of the mean spacing, so that depth per pixel
-    does not depend on their number. Opacities are 0.3 to 0.95.
+    """A wall of random splats that fills a 640x480 view. Their radii are 0.95 of the mean spacing, so that layers per
+    pixel do not depend on their number. Opacities are 0.3 to 0.95.
     """
     rng = np.random.default_rng(num_splats)
     half = 1.05 * WALL * np.array([VGA.width / VGA.fx, VGA.height / VGA.fy]) / 2

@@ -1,8 +1,8 @@
 """Table I of the paper, by one command: which forms of the Matern field are finite, at which l, and their errors.
 
 100 points on the unit circle, without radii (as in the paper) and with radii from 1 mm to 30 cm, queried at 41 x 41
-points on [-2, 2] x [-2, 2]. A cell has a tick if every value is finite, as in the paper, and the largest difference
-from the same weights' float64 field in the log domain, which is finite everywhere.
+points on [-2, 2] x [-2, 2]. A cell has a tick if every value is finite, as in the paper. It also has the largest
+difference from the same weights' float64 field in the log domain, which is finite everywhere.
 
 Forms, with M = (K + noise I)^-1 y of eq. 12, lumped (eq. 15) or of the full process:
 `eq. 7 to 9` as printed; `eq. 12` as printed, shifted by the nearest centre; `log domain`: radius and weight in the

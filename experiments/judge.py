@@ -90,7 +90,7 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
 @dataclass(frozen=True, kw_only=True)
 class Contact:
     """A place of a motion, such as the deepest contact: the posture q (J,), the number of the arm's sphere, the
-    touched point (3,) [m], world, the time in words, and is_own: the point is the arm's own.
+    touched point (3,) [m], world, and the time in words. is_own: the point is the arm's own.
     """
 
     q: Float64

@@ -114,8 +114,8 @@ class SideBySide:
 
 
 def clearance_picture(path: Path, clearance: Mapping[str, Float64], period: float, margin: float) -> None:
-    """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s], with its least value
-    marked, each motion's end as a bar, and the margin [m] as a line. NaN leaves gaps.
+    """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s]. Its least value is
+    marked; each motion's end is a bar, and the margin [m] a line. NaN leaves gaps.
     """
     with drawn_figure(path, 4.8) as figure:
         axes = figure.subplots()

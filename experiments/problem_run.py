@@ -1,5 +1,5 @@
-"""One problem of a study as a separate run: its trials as rows of a table, written and read without loss, and the
-verdict that no green trial was false.
+"""One problem of a study as a separate run. Its trials are rows of a table, written and read without loss; its
+verdict is that no green trial was false.
 """
 
 import csv

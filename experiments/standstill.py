@@ -157,11 +157,11 @@ def monitored_standstill(
 ) -> Standstill:  # fmt: skip
     """The path of `motion` from `start_ns`, time-stretched by every stop; people move in the log's time all along.
 
-    q(t) = path(s(t)) with 0 <= s' <= 1: the arm never leaves the path, and goes on from where it was held. It brakes
-    and starts with |s''| <= max_acceleration / (the path's fastest joint speed), so that no joint changes its speed
-    by more than `max_acceleration` [rad/s^2] on that account; 0 stops it at once, which favours it. With somebody in
-    the zone from the start it stands. After the log's end the last scene stays; a stop that then lasts longer than
-    `max_wait` [s] ends the run.
+    q(t) = path(s(t)) with 0 <= s' <= 1: the arm never leaves the path, and continues from its stop. It brakes and
+    starts with |s''| <= max_acceleration / (the path's fastest joint speed). Thus braking accelerates no joint by
+    more than `max_acceleration` [rad/s^2]; 0 stops the arm at once, which favours it. If a person is in the zone at
+    the start, the arm begins stopped. After the log's end, the last scene stays; a stop longer than `max_wait` [s]
+    then ends the run.
     """
     tick, end_s = round(period * 1e9), (motion.last_ns - start_ns) * 1e-9
     change = np.inf if max_acceleration == 0 else period * max_acceleration / max(_fastest(motion, start_ns), 1e-9)

@@ -31,12 +31,12 @@ MOST_NAMED = 5  # problems that are missing
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest:
-    """Run a study into the folder `out`; a second run goes on there.
+    """Run a study into the folder `out`; a second run continues there.
 
-    trials: problems of each environment at most (None: as many as the paper's); problems: MotionBenchMaker's folder
-    (None: that of SPLATCTRL_REAL_DATA, if there is one); methods: of the study, none for all that are installed;
-    width [px] of the images (None: the study's own); shard: (i, n), every n-th problem from the i-th on; made: tables
-    of trials or folders of studies, whose trials are merged instead of running any.
+    trials: most problems of each environment (None: the paper's number). problems: MotionBenchMaker's folder (None:
+    below SPLATCTRL_REAL_DATA, if there). methods: of the study; empty for all installed methods. width [px]: of the
+    images (None: the study's). shard: (i, n), every n-th problem from the i-th on. made: tables of trials or folders
+    of studies to merge, instead of running problems.
     """
 
     study: str

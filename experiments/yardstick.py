@@ -68,10 +68,10 @@ class MotionFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class Yardstick:
-    """What all motions of a task are measured by: the frame and the pose (4, 4) it should reach, and distances.
+    """Measures of all motions of a task: the frame, the pose (4, 4) that it should reach, and distances.
 
-    distances_at names the distances known at a stamp, the controller's own as ``barrier``; certified_at is as
-    `proved_clearance` takes it; truth is None where it is not known.
+    distances_at names the distances known at a stamp, the controller's own as ``barrier``; certified_at: for
+    `proved_clearance`; truth: None if unknown.
     """
 
     model: RobotModel

@@ -30,9 +30,9 @@ ROBOT = "the robot"
 class Rows:
     """Residuals (M,) and sigma (M,) [m] of two views, or of a frame and the robot.
 
-    jacobian (M, 17): derivatives by the unknowns `columns` (17,): the two cameras' and the clock. clusters (M,):
-    residuals of equal number and `alike` have correlated errors. num_laid: points that should lie on the other
-    surface, even beyond the reach. num_hidden: points of num_laid that occlude the robot.
+    jacobian (M, 17): by the unknowns `columns` (17,) of the two cameras and the clock. clusters (M,): residuals of
+    equal number and `alike` have correlated errors. num_laid: points that should lie on the other surface, even
+    beyond the reach. num_hidden: points of num_laid that occlude the robot.
     """
 
     between: tuple[str, str]

@@ -27,7 +27,7 @@ from splatctrl_cli.records import Float64, RgbdFrame, spread
 
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
-    """Rows of `displacement_of` by camera, without cameras that show too little of the robot.
+    """Rows of `displacement_of` by camera, without cameras that show too little robot.
 
     A displaced stationary camera is corrected if the arm moves and the correction puts each link in place. Its row
     then has `T_recorded_camera` (16 numbers by row), and `left_mm`, the last step. If one displaced camera cannot be
@@ -103,7 +103,7 @@ def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, An
     of their middle.
 
     Takes two Gauss-Newton steps on point-to-plane distances, with Huber's weight beyond two sigma. `DISPLACED_ALIKE`
-    neighbouring pixels count as one, because their errors correlate. `distance_mm` is `DISPLACED_WIDTH` if less than
+    neighbouring pixels count as one: their errors correlate. `distance_mm` is `DISPLACED_WIDTH` if less than
     `DISPLACED_SHARE` of the expected pixels lie within that distance of the robot.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]

@@ -106,9 +106,9 @@ STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: l
 class ArmRows:
     """Distances of M points from the robot's surface: residual (M,) [m], positive outside.
 
-    jacobian (M, 6): derivatives by the camera's rotation and translation in its frame. clock (M,) [m/s]: derivative
-    by the clock. points, normals (M, 3): camera frame. num_seen: pixels that should show the robot. num_hidden:
-    pixels of num_seen with depth over `width` nearer.
+    jacobian (M, 6): by the camera's rotation and translation, own frame. clock (M,) [m/s]: by the clock. points,
+    normals (M, 3): camera frame. num_seen: pixels that should show the robot. num_hidden: pixels of num_seen with
+    depth over `width` nearer.
     """
 
     residual: Float64

@@ -253,7 +253,7 @@ def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float
     """The bends of the cameras' depths, solved jointly with poses from `refined`.
 
     Each half (every second view) of a camera's views must give bends that reduce the other half's distances by
-    `BEND_GAIN`, compared with poses alone. Cameras need `BEND_VIEWS` views, and a cosine of `BEND_ALIKE` between the
+    `BEND_GAIN`, compared with poses only. Cameras need `BEND_VIEWS` views, and a cosine of `BEND_ALIKE` between the
     halves' bends.
     """
     views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]

@@ -127,7 +127,7 @@ def derive_by_twists(own: Float64, projected: Float64, gradient: Float64, T: Flo
 
     own (K, 3): points in the first camera's frame, which T (4, 4) maps to the second's. gradient (K, 3): by
     `projected`. Motions are in each camera's frame. ``exp(x)`` moves a point p by ``x[:3] x p + x[3:]``, so ``g . T
-    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``. For the second camera, the sign is opposite.
+    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``. The second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([_cross(own, along), along, _cross(gradient, projected), -gradient])
@@ -154,7 +154,7 @@ def overlap_rows(
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
     """A stationary camera's frame, with mean inverse depths near their median.
 
-    Depth is 0 unless half of the frames agree with the median within three `depth_sigma`.
+    Half of the frames must agree within three `depth_sigma`, else depth is 0.
     """
     if len(frames) == 1:
         return frames[0]

@@ -23,7 +23,7 @@ class ArmAgreement:
     """Measured minus rendered depth on the robot's pixels, in one camera's frames.
 
     median [m]: of differences within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance
-    from the median (limited to 0 to `ARM_COVER`), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR`
+    from the median (within 0 and `ARM_COVER`), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR`
     behind. num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one ratio
     fits most.
     """

@@ -35,7 +35,7 @@ class Thumbnail:
 class ImageWatch:
     """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` are decoded, later images ever more rarely. thumbnails: stamp [ns] and image of
+    The first `limits.DECODED_IMAGES` are decoded, later images ever fewer. thumbnails: stamp [ns] and image of
     `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
     """
 

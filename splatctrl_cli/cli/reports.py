@@ -61,7 +61,7 @@ def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> N
 def tell_of_failure(
     words: Sequence[str], args: argparse.Namespace | None, line: str, code: int, start: float
 ) -> None:
-    """Report a command without a verdict; if the report fails too, print why.
+    """Report a command without a verdict; if reporting fails, print why.
 
     args: None for unparsed `words`. start: by time.perf_counter.
     """

@@ -39,7 +39,7 @@ WORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One criterion or gate. group: recording and command; unique together with the name.
+    """One criterion or gate. group: recording and command; unique with the name.
 
     sentence: the finding in one line; text: the full finding; seconds: 0 if not timed.
     """
@@ -71,7 +71,7 @@ class Suite:
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
     """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: the verdict's outcome; if it occurs and is not "passed", every case passes.
+    expected: outcome; if it is not "passed" and occurs, every case passes.
     """
     reasons = verdict["reasons"]
     names = dict.fromkeys(reason["criterion"] for reason in reasons)
@@ -108,7 +108,7 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
-    """Cases not passed, with suites, in the order failed, error, not evaluable, skipped."""
+    """Cases not passed, with suites, worst first: failed, error, not evaluable, skipped."""
     cases = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
     return sorted(cases, key=lambda pair: WORST_FIRST.index(pair[1].kind))
 

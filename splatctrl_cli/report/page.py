@@ -104,7 +104,7 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
-    """A solid's mesh.
+    """Mesh.
 
     size (3,): half edges of a box; radius, half length of a cylinder or capsule; radius of a ball.
     """

@@ -314,7 +314,7 @@ def column(rows: FloatRows, number: int) -> Float64:
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
     """Start and length [s] of intervals on the axis `span_s`.
 
-    Lengths are at least `SHORTEST` of the axis. Touching intervals are joined.
+    Lengths are at least `SHORTEST` of it. Touching intervals are joined.
     """
     least = SHORTEST * (span_s[1] - span_s[0])
     drawn: list[tuple[float, float]] = []

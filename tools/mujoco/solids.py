@@ -36,7 +36,7 @@ class Solid:
     """A solid: `box` (half sizes), `cylinder` or `capsule` (radius, half length along z), `ball` (radius) or `lathe`.
 
     A lathe turns a `profile` (P, 2) of radii and rising heights [m], whose ends lie on the axis, about z. link: the
-    link that it is fixed to, with `track` in that link's frame; held: from, to [s] while it moves with the robot
+    link that it is fixed to, with `track` in that link's frame. held: from, to [s] while it moves with the robot
     although its track is in the world. lost: share of the solid's pixels that return no depth.
     """
 
