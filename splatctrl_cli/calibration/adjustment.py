@@ -162,7 +162,7 @@ class Adjustment:
         return (float(np.mean(means)) if means else most), sum(laid.values())
 
     def distance(self, estimate: Estimate) -> float | None:
-        """Largest median distance [m] of a pair, cut at the first reach; None without enough points.
+        """Largest median distance [m] of a pair, cut at the first reach; None with few points.
 
         Points that occlude the robot do not count.
         """

@@ -98,7 +98,7 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
 
 
 def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
-    """Matrix (P, P) from unknowns to displacements [m] of what the cameras see."""
+    """Matrix (P, P) from unknowns to displacements [m] in view."""
     unknowns = adjustment.unknowns
     reach = np.eye(unknowns.size)
     for camera in unknowns.cameras:

@@ -1,7 +1,4 @@
-"""Errors of cameras' poses against the visible robot, and corrections.
-
-If all cameras show the same error, the robot may be misplaced.
-"""
+"""Errors of cameras' poses against the visible robot, and corrections."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

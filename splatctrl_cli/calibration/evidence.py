@@ -133,7 +133,7 @@ class Arm:
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
-        """T_world_link (4, 4) at a time [ns]; None without joint positions at that time."""
+        """T_world_link (4, 4) at a time [ns]; None without joint positions."""
         q = self.posture(stamp_ns)
         return None if q is None else self.model.frame_pose(q, link)
 

@@ -154,7 +154,7 @@ def hit_surface(
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
     """View a's points in view b's frame, hits, surface, normals and distances.
 
-    T (4, 4) maps a to b. Hits and distances are (K,), other arrays (K, 3). At hits, both surfaces face alike.
+    T (4, 4) maps a to b. Arrays are (K, 3) or (K,). At hits, both surfaces face alike.
     """
     points = transform_points(T, a.depth.points[which])
     lands, surface, normals = landed(points, b.depth)

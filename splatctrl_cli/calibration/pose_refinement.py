@@ -203,7 +203,7 @@ def refined_poses(
     """Refine the poses of `free` (N,) frames.
 
     scale: divides the recording's lengths. A wide prior anchors all poses. Frames that would move beyond
-    `REFINE_FARTHEST` stay as recorded. With must_gain, so do frames whose judging points agree no better.
+    `REFINE_FARTHEST` stay as recorded. With must_gain, so do frames whose judging points gain nothing.
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]

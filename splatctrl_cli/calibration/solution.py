@@ -189,7 +189,7 @@ def _add_depths(solution: Solution) -> Solution:
 
 
 def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
-    """Offsets (P,) of scales from 1 and biases from 0, covariance (P, P), and free columns."""
+    """Offsets (P,) of depth unknowns from 1 or 0, covariance (P, P), and free columns."""
     unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
     off, free, usual = np.zeros(unknowns.size), [], []
     for camera in unknowns.cameras:

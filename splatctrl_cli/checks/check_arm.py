@@ -233,7 +233,7 @@ def _own_offsets(
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
     """Remedy that names two joints to exchange.
 
-    After the exchange, the arm is where depth shows it. Empty without such a pair.
+    The arm is then where depth shows it. Empty without such a pair.
     """
     few = spread(thin_frames(frames), limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)

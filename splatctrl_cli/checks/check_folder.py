@@ -117,7 +117,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, minus a parabola for gloss, which varies slowly."""
+    """Log brightness (N, B) by bands of rows, minus a parabola for slowly varying gloss."""
     gains_by_band = bands.gains(np.ones(bands.num_images, np.bool_))
     logs = np.log(gains_by_band).mean(axis=2)
     if bands.misfit(gains_by_band) > limits.EXPOSURE_LEFT * bands.misfit(gains):

@@ -42,9 +42,9 @@ def check_views(
 ) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
     """Compare views from different places, of one moment or a static scene.
 
-    Returns the findings, the frames at fitting scales, and those frames at fitting poses. used: metres per count of
-    depth by camera, None for floats. is_sure: False if the unit is doubtful; views must then overlap. only_errors:
-    seek wrong poses only if scales are wrong.
+    Returns findings, frames at fitting scales, and those at fitting poses. used: metres per count of depth by camera,
+    None for floats. is_sure: False if the unit is doubtful; views must then overlap. only_errors: seek wrong poses
+    only if scales are wrong.
     """
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)

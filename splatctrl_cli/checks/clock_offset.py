@@ -132,9 +132,8 @@ def estimate_clock_offset(
     """The offset at which robot and image motion correlate best.
 
     states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette.
-    Otherwise, coarser, whole images are compared with joint motion. The offset is the parabolic peak of the
-    correlation's mean over cameras. It is unknown without motion, at low correlation, with a rival peak, or at the
-    search's end.
+    Otherwise, coarser, whole images are compared with joint motion. The offset is the parabolic peak of the mean over
+    cameras. It is unknown without motion, at low correlation, with a rival peak, or at the search's end.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)

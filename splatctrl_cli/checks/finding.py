@@ -280,7 +280,7 @@ class CheckReport:
 
 
 def find_lacks(*, num_cameras: int, num_frames: int, states_lack: str) -> dict[str, str]:
-    """Missing data by later command, "" for none. states_lack: why states are missing."""
+    """Missing data by later command. states_lack: why states are missing."""
     is_too_short = num_cameras == 1 and 0 < num_frames < 3
     few = "one camera and less than three frames: nothing can be held out; record more views" if is_too_short else ""
     return dict.fromkeys(ALL, "") | {"score": few, "replay": states_lack}

@@ -144,8 +144,8 @@ def option(
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
     kind: converts the text, or a tuple of choices. default: shown in the help. fields: of a request, each with a
-    function of the option's value, or the function's MODULE:NAME if heavy. By default, the option sets the field of
-    its name. sets: a key of the configuration, which implies the kind. more: arguments of argparse.
+    function of the option's value, or the function's MODULE:NAME if heavy. Default: the field of its name. sets: a
+    key of the configuration, which implies the kind. more: arguments of argparse.
     """
     if sets is not None:
         declared, of_default = sets[0].declared[sets[1]], type(getattr(*sets))

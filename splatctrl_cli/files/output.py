@@ -182,9 +182,8 @@ def output_path(
 
     A failure removes it; an interrupted run leaves it. If it contains the file `checkpoint`, failed writes and device
     faults leave it, too. `resume` yields such a folder, and no failure removes it. If `path` is a link, its target is
-    written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind. Raises
-    UsageError also for a foreign folder, another writer, or an unwritable parent. Raises WriteError if writing
-    failed; other errors pass.
+    written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind. Also for a
+    foreign folder, another writer, or an unwritable parent. Raises WriteError if writing failed; other errors pass.
     """
 
     def can_go_on() -> bool:

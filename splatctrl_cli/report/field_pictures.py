@@ -132,7 +132,7 @@ def gradient_picture(
 ) -> None:
     """Write the gradient's length in a slice across z, and its histogram over the grid.
 
-    histogram: number of cells by length. Bin k is about k times `bin_width`; the last counts all longer ones.
+    histogram: number of cells by length. Bin k is about k times `bin_width`, the last also above.
     """
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]

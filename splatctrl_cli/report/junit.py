@@ -41,7 +41,7 @@ WORDS = {
 class Case:
     """One criterion or gate. group: recording and command; unique with the name.
 
-    sentence: the finding in one line; text: the full finding; seconds: 0 if not timed.
+    sentence: the finding in one line; text: in full; seconds: 0 if not timed.
     """
 
     name: str

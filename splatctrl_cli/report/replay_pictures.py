@@ -71,7 +71,7 @@ def clearance_picture(
 ) -> None:
     """Write clearance curves (T,) [m] over `seconds` (T,), with margin [m] and event strips.
 
-    NaN leaves gaps. Space below the margin is shaded; minima are marked.
+    NaN leaves gaps. Space below the margin is shaded, minima are marked.
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(path, 4.8 + _strip_height(shown)) as figure:
