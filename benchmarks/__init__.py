@@ -1,1 +1,1 @@
-"""What the tool costs: `python -m benchmarks` (see docs/benchmarks.md). Not tests: nothing here fails a build."""
+"""Costs of the tool: `python -m benchmarks` (see docs/benchmarks.md). No benchmark fails a build."""

@@ -35,7 +35,7 @@ NOISE = 1.3  # a ratio that fell by less than this factor says nothing on a shar
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run and report; 1 where --gate is given and a limit or the baseline is missed."""
+    """Run and report; with --gate, return 1 if a limit or the baseline is missed."""
     parser = _parser()
     args = parser.parse_args(argv)
     unknown = [name for name in args.names if name not in NAMES + NAMED]
@@ -84,7 +84,7 @@ def _print(result: Result) -> None:
 
 
 def _missed_limits(results: Mapping[str, Result]) -> list[str]:
-    """Print every limit and what it was held against; the missed ones."""
+    """Print every limit and the figure compared with it; return the missed limits."""
     rows, missed = [], []
     for name, result in results.items():
         for limit in result.limits:
@@ -99,7 +99,7 @@ def _missed_limits(results: Mapping[str, Result]) -> list[str]:
 
 
 def _compare(results: Mapping[str, Result], path: Path) -> list[str]:
-    """Print the ratios within this run beside those of the baseline; the ones that fell by more than the noise."""
+    """Print this run's ratios next to the baseline's; return ratios that fell by more than noise."""
     if not path.is_file():
         print(f"no baseline at {path}\n")
         return []

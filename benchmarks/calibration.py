@@ -1,9 +1,9 @@
-"""Truth against what `calibrate` finds on simulated set-ups: cameras about an arm at a table, wrongly recorded.
+"""Errors of `calibrate` on simulated set-ups: cameras about an arm at a table, with wrongly recorded poses.
 
     python -m benchmarks.calibration --setups 50 --csv bench_output/calibration.csv
 
-Each set-up is a log of 30 frames a camera. Its seed draws cameras, things, motion, how far the recorded poses are
-off, the clock of the joint states and, in every second one, the depth scale of one camera. A row of the CSV is one
+Each set-up is a log of 30 frames a camera. Its seed draws cameras, objects, motion, errors of recorded poses, and the
+clock of the joint states. In every second set-up, it also draws one camera's depth scale. A row of the CSV is one
 unknown.
 """
 
@@ -63,7 +63,7 @@ UNITS = {"position": ("mm", 1e3), "rotation": ("deg", 180 / np.pi), "clock": ("m
 
 
 class SetUp(Recording):
-    """What a seed draws: three cameras that stand still; with `has_wrist` one of them, and one on the arm's hand."""
+    """A seed's draw: three stationary cameras; or with `has_wrist`, one stationary camera and one on the hand."""
 
     def __init__(self, seed: int, options: RecordingOptions = OPTIONS, *, has_wrist: bool = False) -> None:
         self._rng = rng = np.random.default_rng([seed, 1])
@@ -88,14 +88,14 @@ class SetUp(Recording):
         return Scene(primitives=things, temporary=(visitor,), motion=motion)
 
     def joint_states(self) -> Iterator[JointState]:
-        """From before the first frame to after the last, by the robot's clock."""
+        """Joint states from before the first frame to after the last, by the robot's clock."""
         for index in range(-10, int(self.options.duration_s * JOINT_RATE) + 10):
             position, velocity = self._motion.at(index / JOINT_RATE)
             stamp_ns = self.start_ns + index * 10**9 // JOINT_RATE - round(self.clock * 1e9)
             yield JointState(stamp_ns=stamp_ns, position=position, velocity=velocity)
 
     def frames(self) -> Iterator[RgbdFrame]:
-        """Of cameras that stand still, the first of which measures depths wrongly, and of the one that moves."""
+        """Frames of stationary cameras, the first with wrong depths, and of the moving camera."""
         for frame in super().frames():
             is_first = frame.camera == self.names[0]
             yield replace(frame, depth=frame.depth / np.float32(self.scale)) if is_first else frame
@@ -167,7 +167,7 @@ class Error:
 
 
 def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
-    """Of each unknown: along and about the axes that the file states its sigmas for."""
+    """Errors of each unknown, along and about the axes of its sigmas in the file."""
     named: dict[str, Any] = {"kind": kind, "seed": setup.options.seed}
     cameras = {camera.name: camera.T_world_camera for camera in setup.cameras}
     for name, found in result.calibration.cameras.items():
@@ -192,7 +192,7 @@ def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
 
 
 def errors_of_open3d(setup: SetUp, log: Path) -> Iterator[Error]:
-    """Of Open3D's multiway registration of what each camera sees in most frames; it states no sigma."""
+    """Errors of Open3D's multiway registration of each camera's `still_frame`; Open3D states no sigma."""
     frames = [record for record in open_source(log).records() if isinstance(record, RgbdFrame)]
     still = [still_frame([frame for frame in frames if frame.camera == name]) for name in setup.names]
     for camera, T in list(zip(setup.cameras, multiway(still), strict=True))[1:]:
@@ -211,7 +211,7 @@ def errors_of_open3d(setup: SetUp, log: Path) -> Iterator[Error]:
 
 
 def trial(kind: str, seed: int, folder: Path) -> list[Error]:
-    """One set-up of a kind. Raises NotEvaluableError where `calibrate` refuses."""
+    """Errors of one set-up of a kind. Raises NotEvaluableError if `calibrate` does."""
     setup = SetUp(seed, has_wrist=kind == "wrist")
     if kind in (ALONE, OPEN3D):
         setup.off[setup.names[0]] = np.eye(4)
@@ -226,7 +226,7 @@ def trial(kind: str, seed: int, folder: Path) -> list[Error]:
 
 
 def lines(rows: Sequence[Error]) -> Iterator[str]:
-    """A table: errors by kind and unknown, per camera as lengths, and how many axes lie within two sigma."""
+    """A table: errors by kind and unknown, as lengths per camera, and the share of axes within two sigma."""
     header = ("set-up", "error of", "", "median", "95 %", "largest", "stated sigma", "within 2 sigma")
     shown = []
     for kind in KINDS:

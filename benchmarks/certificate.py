@@ -1,8 +1,8 @@
-"""A million random queries against what a baked grid certifies: not one may read more than the exact distance.
+"""A million random queries of a baked grid's certified distances: none may exceed the exact distance.
 
 The exact distance is that to the splats' spheres, in float64 over all pairs. Prints per scene how many queries break
-each promise, how much the bound gives away, and how often and by how much the interpolated `sdf`, which promises
-nothing between cell centres, exceeds the exact distance.
+each bound, and how far the bounds stay below the exact distance. It also prints how often and by how much the
+interpolated `sdf`, which bounds nothing between cell centres, exceeds the exact distance.
 """
 
 from collections.abc import Sequence
@@ -29,11 +29,12 @@ PROMISES = ("bound_at_cell", "bound_nearest_cell", "bound_interpolated", "certif
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What one scene's grid was asked, and what it answered.
+    """Results of one scene's grid.
 
-    excess: by promise, the number of queries above the exact distance and the largest excess [m] (negative where
-    none is); given_away: median [m] by which bound (of the nearest cell, interpolated) and certified stay below;
-    interpolated_*: of sdf between cell centres, the share above exact, and the median and largest excess of those.
+    excess: by bound, the number of queries above the exact distance and the largest excess [m] (negative if none is
+    above). given_away: median [m] by which the bounds (nearest cell, interpolated, certified) stay below the exact
+    distance. interpolated_*: share of sdf values between cell centres above the exact distance, and their median and
+    largest excess [m].
     """
 
     scene: str
@@ -82,7 +83,7 @@ def ask(scene: str, centers: Float64, radii: Float64, voxel: float, num_queries:
 def judge(
     scene: str, grid: DistanceGrid, centers: Float64, radii: Float64, num_queries: int, *, seed: int = 0
 ) -> Verdict:
-    """Hold a grid to its word at random points and at random cells, as many of each."""
+    """Compare a grid with the exact distance at equal numbers of random points and random cells."""
     voxel = grid.voxel
     shape = np.array(grid.channels["sdf"].shape)
     rng = np.random.default_rng(seed)
@@ -126,7 +127,7 @@ def over_of(error: Float64) -> tuple[int, float]:
 
 
 def given_away(verdicts: Sequence[Verdict]) -> list[str]:
-    """The table of the interpolated sdf, and of what bounds give away."""
+    """The table of the interpolated sdf, and of the bounds' gaps below the exact distance."""
     names = ("bound_nearest_cell", "bound_interpolated", "certified")
     header = (
         *("scene", "bound, nearest cell", "bound, interpolated", "certified"),

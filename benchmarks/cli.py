@@ -12,7 +12,7 @@ SPLATCTRL = str(Path(sys.executable).with_name("splatctrl"))
 
 
 def run(options: Options) -> Result:
-    """--help beside a bare interpreter, `reconstruct` on the sample log, and `demo` where asked for."""
+    """Time --help and a bare interpreter, `reconstruct` on the sample log, and with `with_demo` also `demo`."""
     starts = [(process([SPLATCTRL, "--help"]), process([sys.executable, "-c", "pass"])) for _ in range(10)]
     helping, bare = (statistics.median(start[i][0] for start in starts) for i in (0, 1))
     rows = [
@@ -48,7 +48,7 @@ def _reconstruct(out: Path) -> list[str]:
 
 
 def process(command: Sequence[str]) -> tuple[float, float]:
-    """Wall time [s] and peak resident memory [MiB] of a process that has to end well."""
+    """Wall time [s] and peak resident memory [MiB] of a process that must exit with 0."""
     spent = measured(command)
     assert spent.code == 0
     return spent.seconds, spent.mebibytes

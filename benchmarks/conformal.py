@@ -1,14 +1,14 @@
-"""The bound on a map's error beside the truth, on random tables.
+"""The bound on a map's error, compared with the truth on random tables.
 
-Each seed is a table with random things, an arm that crosses it, and (every other seed) a thing that appears and
-leaves; three cameras train in lockstep and the fourth is evidence. Two questions are asked of each scene.
+Each seed is a table with random objects and an arm that crosses it. On every other seed, an object appears and
+leaves. Three cameras train in lockstep; the fourth is evidence. Each scene has two tests.
 
-A further stretch: one stretch of held-out sets is drawn and left out, the bound is made of the others, and what the
-map then misses of the true surface (the same views without noise) is held against it. That is what is promised.
+First, the guarantee: one random block of held-out frame sets is left out, and the other blocks give the bound. The
+map's residuals on the block's true surface (the same views without noise) should not exceed the bound.
 
-The arm: is the map's clearance less the bound, made of all stretches, a lower bound of the true clearance, at every
-state that is truly nearer than `verdict.evidence_reach`? That is what the verdict makes of it; it asks about surface
-that the held-out camera does not see as well, which nobody promises.
+Second, the verdict's use: the map's clearance minus the bound of all blocks should be a lower bound of the true
+clearance. This is tested at every state truly nearer than `verdict.evidence_reach`. It also concerns surface that the
+held-out camera does not see, for which there is no guarantee.
 """
 
 import tempfile
@@ -55,10 +55,10 @@ ASKED = 0.5  # confidence for a further stretch, beside as much as the stretches
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One scene: `kind` still or visited; num_stretches of `length` sets. A further stretch was promised to be within
-    `bound` [m] with `promise` and is so or not; asked for as much as the stretches allow, `highest` and
-    highest_promise. least_margin [m]: the least of true clearance less (the map's less `full`, the bound of all
-    stretches with promise full_promise), inf where no state is near; seconds it took.
+    """One scene: `kind` still or visited; num_stretches blocks of `length` sets. `further` [m]: largest residual of
+    the block left out. It should be within `bound` [m] with probability `promise`; with the highest probability that
+    the blocks allow, within `highest` [m] with highest_promise. least_margin [m]: least true clearance minus (map's
+    clearance minus `full`), inf if no state is near. `full`: bound of all blocks with full_promise.
     """
 
     seed: int
@@ -78,9 +78,9 @@ class Trial:
 
 
 def random_scene(options: RecordingOptions, robot: RobotModel) -> Scene:
-    """Random things on the table instead of those of `tabletop`, and an arm that passes through its waypoints or near
-    them, in any order; on odd seeds one more thing for a third of the time. What the arm would meet is not there:
-    inside of things the field promises nothing, and the map is made of what lies outside of the robot.
+    """Random objects on the table of `tabletop`, and an arm that passes its waypoints, roughly and in random order.
+    On odd seeds, there is one more object for a third of the time. Objects in the arm's path are omitted, because the
+    field is no bound inside objects, and the map excludes the robot.
     """
     seed, span = options.seed, round(options.duration_s * 1e9)
     rng = np.random.default_rng([seed, 7])
@@ -103,7 +103,7 @@ def random_scene(options: RecordingOptions, robot: RobotModel) -> Scene:
 
 
 def run(options: Options) -> Result:
-    """Coverage beside its promise, and the width, by kind and of all."""
+    """Measure coverage, its nominal value, and the width of the bound, by kind and overall."""
     num = QUICK if options.is_quick else NUM_SCENES
     trials = [found for found in map(trial_of, range(num)) if found is not None]
     median = np.median([(trial.num_stretches, trial.length, trial.seconds) for trial in trials], axis=0)
@@ -119,7 +119,7 @@ def run(options: Options) -> Result:
 
 
 def trial_of(seed: int) -> Trial | None:
-    """One scene, None where its held-out sets make fewer than FEWEST_STRETCHES stretches."""
+    """One scene, None if its held-out sets form fewer than FEWEST_STRETCHES blocks."""
     start = time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -208,7 +208,7 @@ def audited(inputs: ReplayInputs, recording: Recording, config: Config) -> tuple
 def judged(
     seed: int, measured: Float64, exact: Float64, over: Float64, confidence: float, seconds: float
 ) -> Trial | None:
-    """The two questions, of a scene's misses with and without noise."""
+    """Both tests, for a scene's residuals with and without noise."""
     length = autocorrelation_time(measured)
     stretch = stretches(len(measured), length)
     scores, deciding = stretch_scores(measured, stretch)
@@ -242,7 +242,7 @@ def _bound(scores: Float64, confidence: float) -> tuple[float, float]:
 
 
 def rows_of(trials: Sequence[Trial]) -> list[list[str]]:
-    """Coverage beside its promise, and the width, by kind and of all."""
+    """Rows of coverage, its nominal value, and the bound's width, by kind and overall."""
     rows = []
     by_kind = sorted(trials, key=lambda trial: trial.kind)
     groups = [(kind, list(group)) for kind, group in groupby(by_kind, key=lambda trial: trial.kind)]

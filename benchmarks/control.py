@@ -25,7 +25,7 @@ SOLVERS = ("clarabel", "daqp")
 
 
 def run(options: Options) -> Result:
-    """The sample log's arm and map: steps from its logged states towards the last one's pose, and their audit."""
+    """Time steps from the sample log's states towards the last state's pose, and the states' audit."""
     config, model = Config(), sample_robot()
     splats = _scene()
     analytic = field_over(Spheres.of(splats.centers, splats.radii), config.field)
@@ -62,7 +62,7 @@ def run(options: Options) -> Result:
 
 
 def _scene() -> SplatSet:
-    """The sample log's map without the arm: no splat within 4 cm of it at any logged state."""
+    """The sample log's map without the arm: no splat within 4 cm of the arm at any logged state."""
     model, splats = sample_robot(), field_splats(sample_fitter().splats())
     centers = model.sphere_centers_batch(np.array([state.position for state in sample_states()]))
     is_free = np.ones(len(splats), dtype=np.bool_)

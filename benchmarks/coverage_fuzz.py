@@ -1,9 +1,9 @@
 """`python -m benchmarks.coverage_fuzz --minutes N`: coverage-guided fuzzing of the readers, with atheris.
 
-atheris (PyPI, no dependency) instruments this program's Python and keeps the inputs that reach new places of it.
-Each reader of `benchmarks.readers` runs in a process of its own for its share of the time. A fault is an exception
-that the reader does not name, an input that takes over 20 s, or a process that dies or grows beyond 2 GiB; a fault
-does not end the run, and inputs at fault are kept.
+atheris (PyPI, no dependency) instruments this program's Python and keeps the inputs that reach new code. Each reader
+of `benchmarks.readers` runs in a process of its own for its share of the time. A fault is an undeclared exception, an
+input that takes over 20 s, or a process that dies or grows beyond 2 GiB. A fault does not end the run; its input is
+kept.
 """
 
 import argparse
@@ -101,7 +101,7 @@ def campaign(name: str, folder: Path, seconds: int, keep: Path) -> Campaign:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Fuzz each reader in turn and print a table; 1 where a fault was found."""
+    """Fuzz each reader in turn and print a table; return 1 if a fault was found."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.coverage_fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0, help="of all readers together")
     parser.add_argument("--only", nargs="+", help="names of readers")

@@ -1,4 +1,4 @@
-"""The voxel density against exact row sums: error of the density, of the distance, and time, by number of splats.
+"""The voxel density compared with exact row sums: errors of density and distance, and time, by number of splats.
 
 A wavy sheet of 1 m x 1 m, l = 2 cm, one core; the distance at 300 points 1 to 20 cm above it, by both weights.
 """
@@ -38,7 +38,9 @@ def run(options: Options) -> Result:
 
 
 def measured(num: int, name: str) -> list[str]:
-    """One kernel on one sheet; the voxel density is the faster of two runs, as its first one warms the transform."""
+    """One kernel on one sheet. The voxel density's time is that of the faster of two runs, because the first warms
+    the transform.
+    """
     kernel, kind = KINDS[name]
     centers, points = sheet(num)
     clusters = Spheres.of(centers, np.zeros(len(centers)))

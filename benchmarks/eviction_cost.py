@@ -1,4 +1,4 @@
-"""What a time step takes to know what has no splat, and to make room for it: a share of the same run."""
+"""Time to find surface without splats and to evict splats for it, as a share of a time step."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ LARGEST_SHARE = 0.03
 
 
 def run(options: Options) -> Result:
-    """`splatctrl reconstruct` on the sample log, with the time in what looks for bare voxels and in what evicts."""
+    """Run `splatctrl reconstruct` on the sample log; measure the parts that find bare voxels and evict."""
     rows, figures = [], {}
     for budget in BUDGETS[:1] if options.is_quick else BUDGETS:
         spent = _spent(budget)

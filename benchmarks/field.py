@@ -1,4 +1,4 @@
-"""Distance and gradient at points, and on grids, beside scipy's k-d tree and tiled torch."""
+"""Distance and gradient at points and on grids, compared with scipy's k-d tree and tiled torch."""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,7 +26,7 @@ Tasks = dict[str, Callable[[], object]]
 
 
 class Report:
-    """Rows for people, figures and ratios for machines, as they come in."""
+    """Rows for readers, figures and ratios for programs, as they are measured."""
 
     def __init__(self) -> None:
         self.rows: list[list[str]] = []
@@ -36,7 +36,7 @@ class Report:
     def add(
         self, key: str, what: str, seconds: float, count: int, threads: int, peer: str, peer_seconds: float
     ) -> None:
-        """A row: what took how long, for how many points, and how long a reference took in the same run."""
+        """Add a row: a task, its seconds and number of points, and a reference's seconds in the same run."""
         unit, scale = ("us", 1e6) if seconds < 1e-2 else ("s", 1.0)
         shown = f"{scale * seconds:.0f} us" if unit == "us" else f"{seconds:.2f} s"
         peer_shown = f"{scale * peer_seconds:.0f} us" if unit == "us" else f"{peer_seconds:.2f} s"
@@ -56,7 +56,7 @@ class Report:
 
 
 def run(options: Options) -> Result:
-    """60 points (an arm's spheres), a million, and grids of 1 cm, against 5,000 and 50,000 splats."""
+    """Measure 60 points (an arm's spheres), a million points, and 1 cm grids, with 5,000 and 50,000 splats."""
     report = Report()
     _few_points(report, options)
     _many_points(report, options)
@@ -133,7 +133,7 @@ def _many_points(report: Report, options: Options) -> None:
 
 
 def _tiled_torch(kernel: GpdfField, splats: SplatSet, points: Float64) -> torch.Tensor:
-    """The Matern field as one writes it with torch: all pairs, a few points at a time."""
+    """The Matern field in plain torch: all pairs, a few points at a time."""
     torch.set_num_threads(THREADS)
     length = kernel.kernel.length
     centers = torch.from_numpy(splats.centers)

@@ -1,8 +1,8 @@
-"""How far the distance fields are from exact surfaces, by shape, spacing, radius, field and weights.
+"""Errors of the distance fields on exact surfaces, by shape, spacing, radius, field and weights.
 
-The truth is exact: solids made here, and the closed meshes below SPLATCTRL_REAL_DATA. Errors are field less truth at
-points even in space from 1 to 20 cm outside; positive is a clearance that is not there. The bar that `safe` is held
-to is 1 mm and a third of the spacing, RMSE.
+The truth is exact: solids made here, and the closed meshes below SPLATCTRL_REAL_DATA. Errors are field minus truth at
+points uniform in space from 1 to 20 cm outside; a positive error overstates clearance. The field `safe` must have an
+RMSE of at most 1 mm plus a third of the spacing.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ LENGTHS = (0.01, 0.02, 0.04)  # [m] of the planar bias
 class Row:
     """Accuracy of one field on one covering of one shape: over the whole band, and by the usual bands.
 
-    share_below_hard: of points where the field reads less than the exact distance to the splats.
+    share_below_hard: share of points with a field value below the exact distance to the splats.
     """
 
     shape: str
@@ -72,7 +72,7 @@ class Row:
 
 
 def run(options: Options) -> Result:
-    """Every table; with --quick on solids made here only, at fewer points."""
+    """Every table; with --quick, only on solids made here, at fewer points."""
     num = NUM_QUICK if options.is_quick else NUM_POINTS
     rows = [row for shape in shapes(with_meshes=not options.is_quick) for row in shape_rows(shape, num)]
     bias = [planar_bias(length) for length in LENGTHS]
@@ -147,7 +147,7 @@ def distances(
 
 
 def planar_bias(length: float) -> PlanarBias:
-    """The Matern field over a plane of centres l / 5 apart, wide enough for its rim not to count."""
+    """The Matern field over a plane of centres l / 5 apart, wide enough that its rim has no effect."""
     step, half, num = length / 5, 0.35 + 5 * length, 40
     axis = np.arange(-half, half, step)
     x, y = np.meshgrid(axis, axis, indexing="ij")
@@ -170,7 +170,7 @@ def planar_bias(length: float) -> PlanarBias:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceError:
-    """Error of one field on the box by what is nearest: mean and RMSE [m] before faces, edges and corners."""
+    """Mean and RMSE [m] of one field's error on the box before faces, edges and corners."""
 
     spacing: float
     is_inset: bool
@@ -180,7 +180,7 @@ class PlaceError:
 
 
 def place_errors(box: Shape, num_points: int) -> list[PlaceError]:
-    """A point is before an edge or a corner where two or three of its coordinates are beyond the box's."""
+    """Errors by place; a point is before an edge (corner) if two (three) coordinates exceed the box's."""
     points, truth = points_around(box, num_points, *BAND, seed=1)
     num_beyond = np.count_nonzero((points < box.box.lower) | (points > box.box.upper), axis=1)
     places = [num_beyond == beyond for beyond in (1, 2, 3)]
@@ -206,7 +206,7 @@ def place_errors(box: Shape, num_points: int) -> list[PlaceError]:
 
 @dataclass(frozen=True, kw_only=True)
 class LoneReading:
-    """How much more than the exact distance the fields read on the way to a lone splat: the largest [m]."""
+    """Largest excess [m] of the fields over the exact distance near a lone splat."""
 
     case: LoneSplat
     gpdf: float
@@ -215,7 +215,7 @@ class LoneReading:
 
 
 def lone_reading(case: LoneSplat) -> LoneReading:
-    """From 2 mm to 15 cm before the splat, on the side away from the wall."""
+    """Largest excess from 2 mm to 15 cm before the splat, on the side away from the wall."""
     centers, radii = lone_splat(case.wall, wall_spacing=case.spacing, radius=case.radius)
     steps = case.radius + np.linspace(0.002, 0.15, 149)
     points = np.stack([steps, np.zeros_like(steps), np.zeros_like(steps)], axis=1)

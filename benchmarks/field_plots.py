@@ -1,4 +1,4 @@
-"""The plots of docs/results.md, each of what the code reads now."""
+"""The plots of docs/results.md, each computed by the present code."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ SPACING = 0.01  # [m]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarBias:
-    """Readings of gpdf over a dense plane of centres, at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
+    """Values of gpdf over a dense plane of centres, at heights (40,), and ``z - l log(1 + z / l)`` [m]."""
 
     length: float
     heights: list[float]
@@ -50,7 +50,7 @@ def write_plots(folder: Path, bias: Sequence[PlanarBias]) -> None:
 
 
 def draw_planar_bias(bias: Sequence[PlanarBias]) -> Any:
-    """Measured readings over a plane on the curves of the closed form."""
+    """Draw measured values over a plane on the curves of the closed form."""
     figure, axes = new_figure()
     axes.plot([0, 20], [0, 20], color=COLORS["truth"], linewidth=1, label="the true distance z")
     for one, color in zip(bias, ("#66ccee", COLORS["gpdf"], "#aa3377"), strict=True):
@@ -86,7 +86,7 @@ def draw_error(shape: Shape) -> Any:
 
 
 def draw_levels(shape: Shape) -> Any:
-    """Where each field reads 5 cm, in a vertical cut through the box, the table and the cylinder."""
+    """Draw each field's 5 cm level in a vertical cut through box, table and cylinder."""
     centers, radii = splats_on(shape, SPACING, is_inset=True, seed=0)
     x, z = np.meshgrid(np.linspace(-0.5, 0.4, 361), np.linspace(-0.12, 0.36, 193))
     points = np.stack([x.ravel(), np.full(x.size, 0.13), z.ravel()], axis=1)
@@ -113,7 +113,7 @@ def draw_levels(shape: Shape) -> Any:
 
 
 def draw_lone_splat() -> Any:
-    """What each field reads on the way to a splat that floats before a wall."""
+    """Draw each field's values towards a splat that floats before a wall."""
     figure, panels = new_figure(columns=2)
     steps = np.linspace(0.0, 0.15, 151)
     points = np.stack([steps, np.zeros_like(steps), np.zeros_like(steps)], axis=1)
@@ -130,7 +130,7 @@ def draw_lone_splat() -> Any:
 
 
 def draw_certificate() -> Any:
-    """Along a line past a few balls: exact distance, interpolated sdf, bound of the cell, certified."""
+    """Draw, along a line past a few balls: exact distance, interpolated sdf, bound of the cell, certified."""
     centers = np.array([[0.03, 0.0, 0.0], [0.13, 0.03, 0.012], [0.19, -0.02, 0.0]])
     radii = np.array([0.012, 0.006, 0.02])
     grid = bake(

@@ -1,8 +1,8 @@
 """`python -m benchmarks.fuzz --minutes N`: mutated inputs must neither crash, hang, nor write where they should not.
 
-Each input is a small valid one with some of its bytes, numbers or lengths changed, by a seed that repeats it. It is
-read by a child process under a limit of memory and time. Wanted: an exit code of the list in `splatctrl --help`, one
-line on stderr and no traceback, no file but in the output, and none at all where the input was refused.
+Each input is a small valid input with some bytes, numbers or lengths changed; its seed reproduces it. A child process
+reads the input under limits of memory and time. It must end with an exit code listed in `splatctrl --help`, one line
+on stderr and no traceback. It may write files only in the output, and none if it refused the input.
 """
 
 import argparse
@@ -38,7 +38,7 @@ JOINTS = ("joint_a", "joint_b")
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of one input; `fault` is empty where all was as it should be."""
+    """Result of one input; `fault` is "" without a fault."""
 
     sample: str
     command: str
@@ -51,7 +51,7 @@ class Outcome:
 
 
 def campaign(samples: Sequence[Sample], folder: Path, *, seed: int, stop: float, most: int) -> Iterator[Outcome]:
-    """Yield the outcomes of inputs numbered from `seed` on, until the clock (time.monotonic) says `stop`."""
+    """Yield outcomes of at most `most` inputs, numbered from `seed`, until time.monotonic exceeds `stop`."""
     for number in range(seed, seed + most):
         if time.monotonic() > stop:
             return
@@ -93,7 +93,7 @@ def _filled(part: str, given: Path, box: Path) -> str:
 
 
 def _mutated_copy(sample: Sample, folder: Path, rng: random.Random) -> Path:
-    """A copy of the sample with one of its files changed (sometimes a second, sometimes taken away)."""
+    """A copy of the sample with one or two of its files changed, or removed."""
     root = sample.path if sample.path.is_dir() else sample.path.parent
     chosen = {rng.choice(sample.files) for _ in range(rng.choice([1, 1, 1, 2]))}
     for file in sample.files:
@@ -109,7 +109,7 @@ def _mutated_copy(sample: Sample, folder: Path, rng: random.Random) -> Path:
 
 
 def no_file(path: Path, rng: random.Random) -> None:
-    """Something of that name that is no file: reading it may wait for ever, or never end."""
+    """Put something other than a file at `path`; reading it may wait forever or never end."""
     match rng.choice(["fifo", "folder", "loop", "endless", "nowhere", "socket"]):
         case "fifo":
             os.mkfifo(path)
@@ -143,7 +143,7 @@ def _in_child(arguments: list[str], box: Path) -> tuple[int, int]:
 
 
 def _run(arguments: list[str], box: Path) -> None:
-    """In the child: everything it says into one file, memory limited; never returns."""
+    """Run a command in the child with limited memory and all output in one file; never return."""
     code = 70
     try:
         said = os.open(box / "said", os.O_WRONLY | os.O_CREAT)
@@ -218,7 +218,7 @@ def quiet() -> Iterator[None]:
 
 
 def warm_up(samples: Sequence[Sample], folder: Path) -> None:
-    """Import what the commands need, so that each child starts with it; each valid sample has to be read."""
+    """Import the commands' modules, so that each child starts with them; check that every valid sample is read."""
     box = folder / "box"
     for sample in samples:
         for command in sample.commands:
@@ -238,7 +238,7 @@ def _keep(box: Path, kept: Path) -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Run a campaign; 1 where a fault was found. The inputs at fault are kept in --keep."""
+    """Run a campaign; return 1 if a fault was found. Its input is kept in --keep."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0, help="of the first input; the others follow")

@@ -1,4 +1,4 @@
-"""Changes to the bytes of a valid file that find what a reader believes without looking."""
+"""Changes to a valid file's bytes that find values that a reader does not check."""
 
 import random
 import re
@@ -14,7 +14,7 @@ _STRING = re.compile(rb"[A-Za-z_/.]{3,}")
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """`data` with one to four changes; what is text is changed as text most of the time."""
+    """`data` with one to four changes; text is mostly changed as text."""
     is_text = b"\x00" not in data[:4096]
     for _ in range(rng.choice([1, 1, 2, 4])):
         pool = _TEXT if is_text and rng.random() < 0.8 else _BINARY
@@ -23,7 +23,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
 
 
 def _place(data: bytes, rng: random.Random) -> int:
-    """A place in the data; half the time near its start or end, where headers and indexes are."""
+    """A place in the data; often near its start or end, where headers and indexes are."""
     if not data:
         return 0
     where = rng.random()

@@ -38,7 +38,7 @@ class Sample:
 
 
 def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
-    """All samples below `folder`; `commands` are those that the tool has."""
+    """All samples below `folder`, with those of the tool's `commands` that read them."""
     log = make_log(folder / "log.mcap", LogRecipe(num_frames=4))
     of_log: list[tuple[str, ...]] = [("info", "IN"), ("ingest", "IN", "-o", "OUT.capture"), ("states", "IN")]
     if "check" in commands:
@@ -80,7 +80,7 @@ def _folder(name: str, path: Path, commands: Commands) -> Sample:
 
 
 def plain_log(log: Path, path: Path) -> Path:
-    """The log without compression and checksums, so that what is mutated reaches the decoders."""
+    """The log without compression and checksums, so that mutations reach the decoders."""
     with path.open("wb") as stream:
         writer = McapWriter(stream, chunk_size=4096, compression=CompressionType.NONE, enable_crcs=False)
         writer.start()
@@ -102,7 +102,7 @@ def capture_of(log: Path, path: Path) -> Path:
 
 
 def _images(folder: Path, commands: Commands) -> Sample:
-    """An image folder with its description beside it, poses as a trajectory.log."""
+    """An image folder with its description, and poses in a trajectory.log."""
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True)
     lines = []

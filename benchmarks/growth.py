@@ -1,4 +1,4 @@
-"""How processor time grows: with the views of a still scene, with the messages of a log, with splats.
+"""Growth of processor time with the views of a still scene, the messages of a log, and splats.
 
 The exponent is the slope of log time over log size.
 """
@@ -35,7 +35,7 @@ ROUNDS = 3
 
 
 def run(options: Options) -> Result:
-    """On all processors; a fit with all its iterations, a log of joint states read, an iteration at 640x480."""
+    """Time, on all processors: a whole fit, reading a log of joint states, and an iteration at 640x480."""
     rounds = options.rounds(ROUNDS)
     with tempfile.TemporaryDirectory() as folder:
         times = {
@@ -80,7 +80,7 @@ def _times(tasks: Mapping[int, Callable[[], object]], rounds: int, num_untimed: 
 
 
 def views_on_a_circle(num_views: int) -> list[RgbdFrame]:
-    """Frames of 320x240 of the sample's table and what stands on it, on a circle above it, looking at its middle."""
+    """Frames of 320x240 from a circle above the sample's table, looking at its middle."""
     frames = []
     for index in range(num_views):
         angle = 2 * np.pi * index / num_views

@@ -1,4 +1,4 @@
-"""Colour and depth pairs out of a log into a capture folder and out of it again, beside decoding alone."""
+"""Colour and depth pairs from a log into a capture folder and back, compared with decoding only."""
 
 import sys
 import tempfile
@@ -29,7 +29,7 @@ NOISE_M = 0.002  # of the depth, as a sensor has it: a smooth image would be too
 
 
 def run(options: Options) -> Result:
-    """A log of 640x480 pairs, JPEG and 16-bit PNG, and one of raw depth: pairs per second by what is done."""
+    """Pairs per second by task, for logs of 640x480 pairs with JPEG and 16-bit PNG, or raw depth."""
     num = 60 if options.is_quick else 300
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as name:
@@ -80,7 +80,7 @@ def run(options: Options) -> Result:
 
 
 def write_log(path: Path, num: int, *, has_raw_depth: bool = False) -> Path:
-    """A ROS 2 MCAP, uncompressed, of `num` pairs of one camera that stands still, and joint states."""
+    """Write an uncompressed ROS 2 MCAP with `num` pairs of one stationary camera, and joint states."""
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types
     with path.open("wb") as stream:
@@ -126,7 +126,7 @@ def write_log(path: Path, num: int, *, has_raw_depth: bool = False) -> Path:
 
 
 def _pairs() -> Iterator[tuple[bytes, bytes, "np.ndarray[Any, np.dtype[np.uint16]]", RgbdFrame]]:
-    """JPEG, PNG, depth counts [mm] and frame, again and again: frames of the sample log at twice their size."""
+    """Yield JPEG, PNG, depth counts [mm] and frame endlessly, from sample frames at twice their size."""
     random, found = np.random.default_rng(0), []
     frames = (item for item in open_source(SAMPLE / "log.mcap").records() if isinstance(item, RgbdFrame))
     for small in islice(frames, NUM_IMAGES):

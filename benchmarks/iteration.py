@@ -32,7 +32,7 @@ ROUNDS, TORCH_ROUNDS = 40, 5
 
 
 class KernelIteration:
-    """The iteration that `SceneFitter` does, always from the same parameters, so that every run does the same."""
+    """`SceneFitter`'s iteration, always from the same parameters, so that every run does the same work."""
 
     def __init__(self, problem: FitProblem, threads: int) -> None:
         count = len(problem.parameters)
@@ -85,7 +85,7 @@ def settings(num_splats: int) -> OptimiserSettings:
 
 
 def run(options: Options) -> Result:
-    """5,000 and 10,000 splats at 640x480, random and the sample log's own; plain torch on one thread beside them."""
+    """5,000 and 10,000 splats at 640x480, random and of the sample log, compared with plain torch on one thread."""
     counts = (5000,) if options.is_quick else (5000, 10000)
     problems = {f"wall_{count}": wall_problem(count) for count in counts}
     problems |= {f"sample_{count}": sample_problem(count) for count in counts}
@@ -158,7 +158,7 @@ def _measured(
 
 
 def _check_same(case: KernelIteration, reference: TorchIteration) -> None:
-    """Raise where kernels and reference do not render the same image: their times would say nothing."""
+    """Raise if kernels and reference render different images, because their times would not be comparable."""
     difference = np.abs(case.planes - reference.run()[0].numpy())
     share = float(np.mean(difference > DIFFERENCE))
     if difference.max() > LARGEST_DIFFERENCE or share > LARGEST_SHARE:

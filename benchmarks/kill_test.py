@@ -1,12 +1,13 @@
-"""`python -m benchmarks.kill_test [--kills N]`: kills commands at random moments; what is half-written must not read.
+"""`python -m benchmarks.kill_test [--kills N]`: kills commands at random moments; partial outputs must not be
+readable.
 
-Each command first runs to its end. Then it is killed (SIGKILL) N times, after a random part of that time, every
-other time with --force over an output that is there. After each kill the output is not there, or holds the same
-bytes as the whole one (but for times and paths in run.json), and what is left under NAME.partial is refused by the
-tool's own readers or is whole, too. Commands that can go on are killed anew N times, every third time once more while
-they go on (`reconstruct` up to nine times, on one to four threads), and then end with --resume: every byte has to be
-that of the whole run, but for the times in run.json. Commands run in forked children that have their imports behind
-them, so that the moments fall where files are written.
+Each command first runs to its end. Then it is killed (SIGKILL) N times, after a random part of that time; every other
+time it has --force and an existing output. After each kill, the output must be missing or equal the complete output
+(except times and paths in run.json). NAME.partial must be complete, too, or be refused by the tool's readers.
+Commands that can resume are killed N times again, every third time once more while they resume (`reconstruct` up to
+nine times, on one to four threads). They then end with --resume, and every byte must equal the complete run's, except
+times in run.json. Commands run in forked children after their imports, so that the moments fall where files are
+written.
 """
 
 import argparse
@@ -41,7 +42,7 @@ _TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json wher
 class Task:
     """A command's arguments before ``-o OUT``, and the name of its output.
 
-    again: how often it is killed while it goes on; threads: how many it has, in turn.
+    again: how often it is killed while it resumes. threads: numbers of its threads, in turn.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Task:
 
 
 def tasks(folder: Path) -> list[Task]:
-    """What is killed; each task may use what the ones before it wrote."""
+    """Tasks to kill; each task may use outputs of earlier tasks."""
     audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *ROBOT, "--max-unknown", "1")
     bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
     fine = (*bake[:-1], "0.06", "--threads", "1")
@@ -69,7 +70,7 @@ def tasks(folder: Path) -> list[Task]:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Kill each task and print a table; 1 where something half-written reads as whole."""
+    """Kill each task and print a table; return 1 if a partial output reads as complete."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kill_test", description=__doc__)
     parser.add_argument("--kills", type=int, default=50, help="of each command")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
@@ -99,7 +100,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 def kill(
     task: Task, folder: Path, num: int, moments: random.Random, only: Sequence[str] | None = None
 ) -> tuple[list[object], list[str]]:
-    """Run a task to its end, then kill it `num` times; its row of the table and what was wrong."""
+    """Run a task to its end, then kill it `num` times; return its row of the table, and faults."""
     out = folder / task.out
     _wait(_start([*task.arguments, "-o", str(out)]), None)  # the first run also imports what it needs
     start = time.monotonic()
@@ -128,7 +129,7 @@ def kill(
 
 
 def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) -> tuple[list[object], list[str]]:
-    """Kill a task `num` times, each time anew, and go on; its row of the table and what was wrong."""
+    """Kill and resume a task `num` times, each time from the start; return its row of the table, and faults."""
     out, box = folder / task.out, folder / "box"
     start = time.monotonic()
     _wait(_start([*task.arguments, "-o", str(out), "--force"]), None)
@@ -158,7 +159,7 @@ def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) 
 
 
 def exact(path: Path) -> dict[str, object]:
-    """sha256 of each file of a folder, by name; of run.json what it says but for times and paths."""
+    """sha256 of each file of a folder, by name; for run.json, its content without times and paths."""
     found: dict[str, object] = {}
     for file in sorted(p for p in path.rglob("*") if p.is_file()):
         data, name = file.read_bytes(), str(file.relative_to(path))
@@ -172,7 +173,7 @@ def exact(path: Path) -> dict[str, object]:
 
 
 def judge(target: Path, whole: dict[str, str]) -> str:
-    """What is wrong with the output that a killed run left; empty where nothing."""
+    """The fault in the output that a killed run left; "" without a fault."""
     if target.exists() and contents(target) != whole:
         return f"{target.name} is there and differs"
     left = partial_path(target)
@@ -182,7 +183,7 @@ def judge(target: Path, whole: dict[str, str]) -> str:
 
 
 def contents(path: Path) -> dict[str, str]:
-    """sha256 of each file, by name in the output; of those that hold times, whether they end as they should."""
+    """sha256 of each file, by name in the output; for files with times, whether they end as they should."""
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     found = {}
     for file in files:
@@ -220,7 +221,7 @@ def _start(arguments: list[str]) -> int:
 
 
 def _wait(child: int, moment: float | None) -> bool:
-    """Wait for a child, or kill it at its moment [s]; whether it ended by itself. Raises where it failed."""
+    """Wait for a child, or kill it at `moment` [s]; return True if it ended by itself. Raises if it failed."""
     start = time.monotonic()
     while moment is None or time.monotonic() - start < moment:
         done, status = os.waitpid(child, os.WNOHANG)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.long_log FOLDER SECONDS`: a moving arm logged at 1 kHz, and what a replay of it takes."""
+"""`python -m benchmarks.long_log FOLDER SECONDS`: a moving arm logged at 1 kHz, and the cost of its replay."""
 
 import argparse
 import sys
@@ -39,7 +39,7 @@ def blocks(num: int) -> Iterator[tuple[Float64, Float64, Float64]]:
 
 
 def write_log(folder: Path, seconds: float, form: str = "npz", *, with_velocity: bool = True) -> Path:
-    """A log of the sample arm that swings above the table; returns what `splatctrl replay` takes.
+    """A log of the sample arm that swings above the table; returns the path for `splatctrl replay`.
 
     npz: a table with its .toml; csv: libfranka's columns; mcap: JointState messages.
     """
@@ -55,7 +55,7 @@ def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> li
 
 
 def run(options: Options) -> Result:
-    """The audit of a log at 1 kHz against a baked grid, as a process: states per second, and memory per state."""
+    """Audit a 1 kHz log with a baked grid in a process: states per second, and memory per state."""
     lengths = (10.0, 60.0) if options.is_quick else (20.0, 120.0)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,8 +1,8 @@
-"""How far sphere marching brings the Matern field to its surface and to the true one, by shape and number of steps.
+"""Errors of the Matern field after sphere marching, by shape and number of steps.
 
-Splats every 5 mm on a plane, and 1 cm apart on a box and a ball, without radii and as balls that touch the surface
-from within; points 1 to 10 cm outside. Error is the distance less the truth, root mean square; `hard` is the exact
-distance to the splats.
+Splats are 5 mm apart on a plane, and 1 cm apart on a box and a ball. They have no radii, or are balls that touch the
+surface from inside. Points are 1 to 10 cm outside. Error is the root mean square of distance minus truth. `hard` is
+the exact distance to the splats.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ Scene = tuple[Float64, Float64, Float64, Float64]  # centres, radii, points, tru
 
 
 def run(options: Options) -> Result:
-    """RMSE of the plain field, after each number of steps, and of hard; bias after 5 steps."""
+    """RMSE of the plain field, of the field after each number of steps, and of `hard`; bias after 5 steps."""
     chosen = list(scenes().items())[:: 2 if options.is_quick else 1]
     return Result(
         title="marching: RMSE [mm]",

@@ -1,11 +1,10 @@
-"""What the MCAP project's own recovery tool keeps of a file: its algorithm, told again in few words.
+"""The algorithm of the MCAP project's recovery tool, in short.
 
-`mcap recover` of foxglove/mcap: go/cli/mcap/cmd/recover.go on go/mcap/lexer.go and
-go/cli/mcap/utils/rebuild_info.go, as published (commit 6dfb6290 and later). It walks over the records and stops at
-the first that cannot be where it stands. By default chunks are copied as they are: their messages are counted by the
-message indexes behind them, and a chunk is unpacked only where a channel is new or it is the last. With
---always-decode-chunk each chunk is unpacked and its checksum compared; one that differs is left out, one that does
-not unpack ends the run.
+`mcap recover` of foxglove/mcap: go/cli/mcap/cmd/recover.go on go/mcap/lexer.go and go/cli/mcap/utils/rebuild_info.go,
+as published (commit 6dfb6290 and later). It reads records in order and stops at the first record that is invalid at
+its place. By default, chunks are copied unchanged. Their messages are counted by the message indexes after them; a
+chunk is unpacked only for a new channel, or if it is the last. With --always-decode-chunk, each chunk is unpacked and
+its checksum compared. A chunk with another checksum is omitted; a chunk that does not unpack ends the run.
 """
 
 import struct
@@ -29,8 +28,8 @@ class StopError(Exception):
 
 @dataclass
 class Recovered:
-    """`claimed`: the messages that the tool says it recovered; `kept`: those that a reader finds in its output which
-    compares checksums.
+    """`claimed`: number of messages that the tool reports. `kept`: messages in its output that a reader with checksum
+    tests finds.
     """
 
     claimed: int = 0
@@ -111,7 +110,7 @@ class _Run:
         self.found.claimed = before[1] + (claimed if indexes else len(self.found.kept) - before[0])
 
     def _unpacked(self, chunk: _Chunk) -> bytes:
-        """Of a chunk that is decoded: nothing where its checksum differs. StopError where it does not unpack."""
+        """Records of a decoded chunk; empty if its checksum differs. Raises StopError if it does not unpack."""
         records = _unpack(chunk)
         if len(records) < chunk.size:
             raise StopError
@@ -132,7 +131,7 @@ class _Run:
 
 
 def _records(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """The records of a file; raises StopError at the first that is not whole, or has opcode 0."""
+    """The records of a file; raises StopError at the first record that is incomplete or has opcode 0."""
     if content[:8] != MAGIC:
         raise StopError
     at = 8

@@ -1,9 +1,9 @@
-"""`python -m benchmarks.mcap_recovery`: messages that come out of damaged MCAP files, here and by MCAP's own tool.
+"""`python -m benchmarks.mcap_recovery`: messages read from damaged MCAP files, here and by MCAP's own tool.
 
-Each of four small logs (zstd, lz4, no compression, no chunks; checksums on) is damaged in five ways at many places:
-cut; one byte changed; 64 bytes of zeros; 64 bytes taken out; eight bytes replaced by a large number. Counted are the
-messages that are right (topic, time and bytes) out of those that the undamaged log holds. The tool is `mcap recover`
-as `benchmarks.mcap_recover` tells it.
+Each of four small logs (zstd, lz4, no compression, no chunks; checksums on) is damaged in five ways at many places.
+The ways are: cut; one byte changed; 64 bytes of zeros; 64 bytes removed; eight bytes replaced by a large number. A
+message is right if the undamaged log contains it (topic, time and bytes). The tool is `mcap recover`, as
+`benchmarks.mcap_recover` implements it.
 """
 
 import argparse
@@ -40,8 +40,8 @@ LOGS: dict[str, tuple[CompressionType, bool]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Counted:
-    """Right messages of one damaged file: read here; kept by the tool, copying and decoding; and how many of the
-    tool's are not among those read here. `claimed`: what the tool says it recovered, copying.
+    """Numbers of right messages of one damaged file. read: here; copied, decoded: by the tool, copying and decoding;
+    lacking: kept by the tool but not read here. claimed: reported by the tool when copying.
     """
 
     read: int
@@ -73,7 +73,7 @@ def damaged(data: bytes, kind: str, step: int) -> Iterator[bytes]:
 
 
 def counted(data: bytes, truth: Counter[Key], path: Path) -> Counted:
-    """What comes out of one damaged file; `path` is where it is written."""
+    """Counts for one damaged file, which is written to `path`."""
     path.write_bytes(data)
     damage = Damage()
     mine = Counter((m.topic.name, m.log_time_ns, m.data) for m in McapLog(path).messages(damage)) & truth
@@ -90,7 +90,7 @@ def counted(data: bytes, truth: Counter[Key], path: Path) -> Counted:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Print a table; 1 where the tool recovers a message that is not read here."""
+    """Print a table; return 1 if the tool recovers a message that is not read here."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mcap_recovery", description=__doc__)
     parser.add_argument("--step", type=int, default=5, help="bytes between places")
     args = parser.parse_args(argv)

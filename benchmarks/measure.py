@@ -22,8 +22,8 @@ ROBOT = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """is_quick: fewer repeats, small sizes only. with_demo: time `splatctrl demo` as well. plots: where the plots of
-    docs/ are written, None for nowhere.
+    """is_quick: fewer repeats, small sizes only. with_demo: time `splatctrl demo` as well. plots: folder for the
+    plots of docs/, None to write none.
     """
 
     is_quick: bool
@@ -37,7 +37,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A bound that a figure has to keep: at most it, or (`is_least`) at least it."""
+    """A bound of a figure: its largest or, with `is_least`, its least allowed value."""
 
     figure: str
     bound: float
@@ -52,9 +52,9 @@ class Limit:
 class Result:
     """What one benchmark measured.
 
-    columns and rows make the table for people; figures the same numbers by name, with the unit as last part of the
-    name. ratios: how many times faster than a reference of the same run (larger is better), which is what two
-    machines, or two days, can be compared by. more: lines of further tables.
+    columns, rows: the printed table. figures: its numbers by name; a name ends in the unit. ratios: how many times
+    faster than a reference of the same run (larger is better); they are comparable between machines and days. more:
+    lines of further tables.
     """
 
     title: str
@@ -83,7 +83,7 @@ def medians(
 ) -> dict[str, float]:
     """Median seconds of each task over `rounds`, after `num_untimed` more.
 
-    The tasks take turns, so that what slows the machine for a while slows all of them.
+    The tasks take turns, so that a temporary slowdown of the machine slows all tasks.
     """
     times: dict[str, list[float]] = {name: [] for name in tasks}
     for index in range(num_untimed + rounds):
@@ -96,9 +96,7 @@ def medians(
 
 @dataclass(frozen=True, kw_only=True)
 class Spent:
-    """What a process took: wall time [s], processor time [s] of it and the system for it, largest resident memory
-    [MiB], and its exit code.
-    """
+    """Cost of a process: wall, user and system time [s], largest resident memory [MiB], and its exit code."""
 
     seconds: float
     processor_s: float
@@ -131,7 +129,9 @@ def rms(error: Float64) -> float:
 
 
 class OtherLoad:
-    """How many cores other processes keep busy, from its making on: on a shared machine, part of every figure."""
+    """Number of cores that other processes keep busy, from its creation on. On a shared machine, it affects every
+    figure.
+    """
 
     def __init__(self) -> None:
         self._start, self._before = time.perf_counter(), _others_seconds()
@@ -142,7 +142,7 @@ class OtherLoad:
 
 
 def _others_seconds() -> float:
-    """Seconds of all cores that went to anything but this process and the children it has waited for."""
+    """Busy seconds of all cores, without this process and the children that it has waited for."""
     stat = Path("/proc/stat")
     if not stat.is_file():
         return 0.0

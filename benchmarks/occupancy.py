@@ -21,7 +21,7 @@ SIDES = {"typical": 1.7, "reach": 2.9, "empty": 8.0}  # [m] of the workspace: a 
 
 
 def run(options: Options) -> Result:
-    """640x480 pixels that see a floor, into 2 cm voxels; beside it the hits alone in numpy, without free space."""
+    """Integrate 640x480 pixels of a floor into 2 cm voxels; compare with numpy that marks only hits."""
     frame = _floor_frame(look_at((1.2, 0.0, 1.2), (0.0, 0.0, 0.0)))
     grids = {(name, threads): _grid(side, threads) for name, side in SIDES.items() for threads in (1, 2)}
     reach = grids["reach", 1]
@@ -66,7 +66,7 @@ def _grid(side: float, threads: int) -> OccupancyMap:
 
 
 def _floor_frame(T_world_camera: Float64) -> RgbdFrame:
-    """What a camera sees of the plane z = 0; no depth where it looks above the horizon."""
+    """A camera's frame of the plane z = 0, without depth above the horizon."""
     rays = back_project(VGA, np.ones((VGA.height, VGA.width))) @ T_world_camera[:3, :3].T
     down = np.minimum(rays[..., 2], -1e-6)
     depth = -T_world_camera[2, 3] / down

@@ -1,7 +1,7 @@
-"""OMPL's RRTConnect on the planner's problems, where it is installed: `pip install ompl`, for this benchmark alone.
+"""OMPL's RRTConnect on the planner's problems, if installed: `pip install ompl`, only for this benchmark.
 
-It asks the same clearance from Python, in two ways: for one state at a time, as its own edge check does at steps of a
-length, and for a whole edge at once by conservative advancement, which is one call an edge as in our planner.
+It calls the same clearance from Python in two ways. OMPL's own edge check calls it for one state at a time, at fixed
+steps. Conservative advancement calls it once for a whole edge, as our planner does.
 """
 
 import importlib.util
@@ -27,8 +27,8 @@ MAX_TIME = 10.0  # [s]
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A path (W, J), CPU seconds to the first one and with OMPL's simplification, calls into Python, and which edges
-    of the path fine samples find in collision.
+    """A path (W, J), CPU seconds to the first path and with OMPL's simplification, and calls into Python. num_hit:
+    edges of the path that fine samples find in collision.
     """
 
     path: Float64
@@ -39,7 +39,7 @@ class Answer:
 
 
 def notes_beside_ompl(clearance: Clearance, problems: Sequence[Problem]) -> list[str]:
-    """A line for each way to check edges; one that says so where OMPL is not there."""
+    """A line for each way to check edges, or one line if OMPL is not installed."""
     if importlib.util.find_spec("ompl") is None:
         return ["OMPL is not installed: not compared"]
     from ompl import util

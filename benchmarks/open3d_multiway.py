@@ -1,4 +1,4 @@
-"""Open3D's multiway registration of still cameras, from the recorded poses: what `calibrate` is compared with."""
+"""Open3D's multiway registration of stationary cameras from recorded poses, for comparison with `calibrate`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,9 @@ DEPTHS = (0.05, 3.0)  # [m]
 
 
 def multiway(frames: Sequence[RgbdFrame]) -> list[Float64]:
-    """T_world_camera (4, 4) of each frame, the first as recorded: point-to-plane ICP of every two, then a graph."""
+    """T_world_camera (4, 4) of each frame, the first as recorded: point-to-plane ICP of every pair, then a pose
+    graph.
+    """
     import open3d
 
     reg = open3d.pipelines.registration

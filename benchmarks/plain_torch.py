@@ -1,7 +1,7 @@
 """The optimiser iteration of `iteration.py` in plain torch operations on the CPU, with autograd: the reference.
 
-The same equations, tiles of 16 pixels and constants as the compiled kernels. Tile lists are padded to the longest of
-a row of tiles and the row is blended at once, which is how one writes it without a kernel of one's own.
+The same equations, tiles of 16 pixels and constants as the compiled kernels. Tile lists are padded to the longest
+list in a row of tiles. The row is then blended at once, because plain torch has no such kernel.
 """
 
 import numpy as np
@@ -123,7 +123,7 @@ class TorchIteration:
 
 
 def _tile_lists(footprint: torch.Tensor, y0: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Splats of each tile of the row at y0, front to back (tiles, K), and which entries are not padding."""
+    """Splats (tiles, K) of each tile of the row at y0, front to back, and a mask of entries that are not padding."""
     u, v, half_width, half_height = footprint[:, [0, 1, 6, 7]].T
     in_row = ((v + half_height >= y0) & (v - half_height <= y0 + TILE - 1)).nonzero()[:, 0]
     u, half_width = u[in_row], half_width[in_row]

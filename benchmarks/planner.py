@@ -33,7 +33,7 @@ EVERY_TRACKED = 25  # problems per one that is followed
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
-    """A problem, its plan, CPU seconds, edges of its path that fine samples find in collision, and its figures."""
+    """A problem, its plan, CPU seconds, number of path edges that fine samples find in collision, and figures."""
 
     problem: Problem
     plan: Plan
@@ -44,7 +44,7 @@ class Solved:
 
 
 def run(options: Options) -> Result:
-    """Solve them all, recheck every edge of every path at 0.01 rad, and say what was not solved."""
+    """Solve all problems, recheck every edge of every path at 0.01 rad, and list unsolved problems."""
     root = os.environ.get("SPLATCTRL_REAL_DATA")
     if root is None or not (Path(root) / ROBOT).is_dir():
         return _skipped()
@@ -100,7 +100,7 @@ class Followed:
 
 
 def _followed(solved: Solved, room: Clearance) -> tuple[Followed, Followed]:
-    """The path followed in joint space, and by QP-IK without a margin of its own."""
+    """Figures of the path followed in joint space, and by QP-IK without a margin."""
     planner, control = PlannerConfig(), ControlConfig(margin=0.0, self_margin=0.0, max_time=60.0, solver="daqp")
     path = time_path(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
     slow = time_path(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
@@ -110,7 +110,7 @@ def _followed(solved: Solved, room: Clearance) -> tuple[Followed, Followed]:
 
 
 def _figures(position: Float64, path: TimedPath, room: Clearance, control: ControlConfig) -> Followed:
-    """Success: the goal was reached, and no posture was in collision."""
+    """Figures of a followed path; success means that the goal was reached without a posture in collision."""
     model, least = room.model, float(np.min(room.at(position)))
     error = pose_error(model.frame_pose(position[-1], FRAME), model.frame_pose(path.waypoints[-1], FRAME))
     return Followed(
@@ -123,7 +123,7 @@ def _figures(position: Float64, path: TimedPath, room: Clearance, control: Contr
 
 
 def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str, float]:
-    """Random edges of 0.3 to 1.5 rad: checks per edge and false accepts, of advancement and of fixed steps.
+    """Checks per edge and false accepts of advancement and of fixed steps, on random edges of 0.3 to 1.5 rad.
 
     Fixed steps are taken in order from the start and end at the first collision. The truth is 1 mrad sampling.
     """
@@ -156,7 +156,7 @@ def _free_postures(room: Clearance, random: np.random.Generator) -> Float64:
 
 
 def _fixed_steps(room: Clearance, start: Float64, end: Float64) -> tuple[Bool, int]:
-    """Which edges samples `COARSE` apart take for free, and how many samples that took."""
+    """Edges that samples `COARSE` apart find free, and the number of samples."""
     is_free, num_checks = np.ones(len(start), dtype=bool), 0
     for e, edge in enumerate(zip(start, end, strict=True)):
         is_hit = room.at(resample(np.array(edge), COARSE)[1:]) < 0

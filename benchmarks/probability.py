@@ -1,10 +1,10 @@
-"""Do the two probabilities of collision mean what they say? Against solids whose distance is exact.
+"""Reliability of the two probabilities of collision, on solids with exact distance.
 
-Box, ball and a table with things on it, covered by balls 1 and 2 cm apart that touch the surface from within, their
-centres then moved by noise of 2 mm. Points are even in space from 5 mm inside to 5 cm outside; one collides when it
-lies inside the solid. The calibrated form has the default `field.error_mean` and `field.error`, which were measured
-here: the mean error of the distance up to 1 cm outside, and its standard deviation. The closed meshes below
-SPLATCTRL_REAL_DATA had no part in it.
+Box, ball and a table with objects are covered by balls 1 and 2 cm apart that touch the surface from inside. Noise of
+2 mm then moves their centres. Points are uniform in space from 5 mm inside to 5 cm outside. A point inside the solid
+collides. The calibrated form has the default `field.error_mean` and `field.error`, which were measured here: the mean
+error of the distance up to 1 cm outside, and its standard deviation. The closed meshes below SPLATCTRL_REAL_DATA were
+not used for this measurement.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ MESHES = ("YcbBanana", "YcbMustardBottle", "spot")
 
 
 def run(options: Options) -> Result:
-    """A row a bin, and the calibration error of each form, of the solids made here and of meshes."""
+    """Rows by bin, and the calibration error of each form, for solids made here and for meshes."""
     rows, notes = [], []
     groups = {"solids": shapes(with_meshes=False), "meshes": [shape for shape in shapes() if shape.name in MESHES]}
     for name, group in groups.items():

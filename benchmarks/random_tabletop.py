@@ -1,4 +1,4 @@
-"""Seeded things on the table of `tabletop`: boxes, cylinders and balls of household size that do not touch."""
+"""Random objects on the table of `tabletop`: boxes, cylinders and balls of household size that do not touch."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ ATTEMPTS = 2000
 
 
 def random_things(seed: int) -> list[Primitive]:
-    """Six to eleven things on the table; the same seed gives the same."""
+    """Six to eleven objects on the table, the same for the same seed."""
     rng = np.random.default_rng([seed, 0])
     wanted = int(rng.integers(NUM_THINGS[0], NUM_THINGS[1] + 1))
     placed: list[tuple[Float64, float]] = []

@@ -1,6 +1,6 @@
-"""The readers of foreign bytes, called in this process: valid inputs to start from, and the errors of each.
+"""The readers of foreign bytes, called in this process, with each one's valid inputs and errors.
 
-For `benchmarks.coverage_fuzz` and for the tests: any bytes are read, or end in one of these errors.
+For `benchmarks.coverage_fuzz` and for the tests: a reader reads any bytes, or raises one of its errors.
 """
 
 import hashlib
@@ -189,7 +189,7 @@ def _splats(made: Path, folder: Path) -> list[Reader]:
 
 
 def splat_suffixes() -> list[str]:
-    """Of the formats whose bytes are read here, and not in a library of theirs."""
+    """Suffixes of the formats whose bytes this package reads itself, without a library."""
     return [suffix for suffix in FORMATS if not suffix.startswith(".usd")]
 
 

@@ -1,4 +1,4 @@
-"""What is measured on: maps made here, and the map of the sample log's beginning."""
+"""Maps to measure on: random maps, and the map of the sample log's beginning."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -35,8 +35,8 @@ class FitProblem:
 
 
 def wall_problem(num_splats: int) -> FitProblem:
-    """A wall of random splats that fills a 640x480 view: radii of 0.95 of their mean spacing, as many pixels deep
-    whatever their number; opacities from 0.3 to 0.95.
+    """A wall of random splats that fills a 640x480 view. Their radii are 0.95 of the mean spacing, so that layers per
+    pixel do not depend on their number. Opacities are 0.3 to 0.95.
     """
     rng = np.random.default_rng(num_splats)
     half = 1.05 * WALL * np.array([VGA.width / VGA.fx, VGA.height / VGA.fy]) / 2
@@ -95,7 +95,9 @@ def sample_problem(num_splats: int) -> FitProblem:
 
 
 def enlarged(frame: RgbdFrame) -> RgbdFrame:
-    """A frame with four pixels for each of its own; a ray through a pixel's centre meets where its four meet."""
+    """A frame with four pixels for each of its own; the ray through an old pixel's centre passes the common corner of
+    its four.
+    """
     k = frame.intrinsics
     return replace(
         frame,

@@ -1,6 +1,6 @@
-"""The QP of random steps by both solvers, by CVXPY where it is installed.
+"""The QP of random steps by both solvers, and by CVXPY if installed.
 
-The programs are those of an arm of seven joints with up to 40 barrier rows, some of which cannot hold together.
+The programs are those of an arm of seven joints with up to 40 barrier rows, some of which contradict each other.
 """
 
 import importlib.util

@@ -1,8 +1,8 @@
-"""Table I of the paper, by one command: which forms of the Matern field are finite, at which l, and how far off.
+"""Table I of the paper, by one command: which forms of the Matern field are finite, at which l, and their errors.
 
-100 points on the unit circle, without radii (as in the paper) and with radii from 1 mm to 30 cm, asked at 41 x 41
-points on [-2, 2] x [-2, 2]. Each cell has a tick where every answer is finite, as the paper has it, and beside it the
-largest difference to the same weights' field in the log domain in float64, which is finite everywhere.
+100 points on the unit circle, without radii (as in the paper) and with radii from 1 mm to 30 cm, queried at 41 x 41
+points on [-2, 2] x [-2, 2]. A cell has a tick if every value is finite, as in the paper. It also has the largest
+difference from the same weights' float64 field in the log domain, which is finite everywhere.
 
 Forms, with M = (K + noise I)^-1 y of eq. 12, lumped (eq. 15) or of the full process:
 `eq. 7 to 9` as printed; `eq. 12` as printed, shifted by the nearest centre; `log domain`: radius and weight in the
@@ -90,7 +90,7 @@ def circle() -> tuple[Float64, Float64]:
 
 
 def literal_cell(form: str, radii: Float64, length: float, weights: str, number: DType) -> Cell:
-    """A form of the paper in numbers of a type, beside the log domain in float64."""
+    """A form of the paper in a number type, compared with the log domain in float64."""
     centers, points = circle()
     log_size, sign = log_weights(centers, radii, length, weights, np.float64)
     truth = log_domain(distances(points, centers), log_size, sign, length)
@@ -123,7 +123,7 @@ def own_cell(radii: Float64, length: float) -> Cell:
 
 
 def cell_of(length: float, found: Array, truth: Array) -> Cell:
-    """What is finite, of where there is a distance at all (a full process may have none)."""
+    """Cell of the values `found` where `truth` is finite (with a full process, it may not be)."""
     asked = np.isfinite(truth)
     is_finite = np.isfinite(found)
     error = np.abs(found.astype(np.float64) - truth)[asked & is_finite]

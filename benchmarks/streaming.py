@@ -1,6 +1,6 @@
 """Two 640x480 cameras, a few iterations per time step: does the map keep up with them?
 
-`python -m benchmarks.streaming FILE` is the process that is measured; it writes what it measured to FILE.
+`python -m benchmarks.streaming FILE` is the measured process; it writes its figures to FILE.
 """
 
 import json
@@ -50,7 +50,7 @@ def run(options: Options) -> Result:
 
 
 def _measured(num_steps: int) -> tuple[list[float], float, float]:
-    """Seconds of each time step, and [MiB]: the decoded frames, and the peak of a process of its own."""
+    """Seconds of each time step, and [MiB]: of the decoded frames, and of the peak of a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "streaming.json"
         spent = measured([sys.executable, "-m", "benchmarks.streaming", str(out), str(num_steps)])

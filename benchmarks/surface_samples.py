@@ -1,4 +1,4 @@
-"""Even samples of a surface, and the largest balls that fit inside it there."""
+"""Evenly spaced samples of a surface, and the largest balls that touch them from inside."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class SurfaceSamples:
 
 
 def sample_mesh(mesh: TriangleMesh, spacing: float, *, seed: int) -> SurfaceSamples:
-    """Samples of a mesh, no two nearer than `spacing` [m]: candidates even by area, thinned (`thin`).
+    """Samples of a mesh, no two nearer than `spacing` [m]: candidates uniform by area, thinned (`thin`).
 
     Raises UsageError for a spacing that is not above 0.
     """
@@ -48,7 +48,8 @@ def check_spacing(spacing: float) -> None:
 
 
 def thin(points: Float64, spacing: float) -> Index:
-    """Indices of points (N, 3) that are pairwise at least `spacing` [m] apart; every other one is nearer to one.
+    """Indices of points (N, 3) that are pairwise at least `spacing` [m] apart; each omitted point is nearer to one of
+    these.
 
     Points are taken in their order: random points give a Poisson-disk sample.
     """
@@ -65,7 +66,8 @@ def thin(points: Float64, spacing: float) -> Index:
 def inscribed_radii(
     samples: SurfaceSamples, largest: float, nearest_surface: Callable[[Float64], Float64], *, tolerance: float = 2e-4
 ) -> Float64:
-    """Radii (N,) [m] of balls inside the surface that touch it at the samples: `largest`, or as large as fits.
+    """Radii (N,) [m] of balls inside the surface that touch it at the samples: at most `largest`, else the largest
+    that fits.
 
     The centres are ``p - r n``. A ball with a surface point q deeper inside than `tolerance` [m] shrinks to
     ``|p - q|^2 / (2 n . (p - q))``, the one through p and q (shrinking ball: Ma, Bae, Choi, 3D medial axis point

@@ -28,7 +28,7 @@ CONTACT = 1e-6  # [m] a sample this near to another solid is where the two touch
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One solid: its samples by (spacing, seed), and the nearest point (Q, 3) of its surface to points (Q, 3)."""
+    """One solid: its samples by (spacing, seed), and the nearest points (Q, 3) of its surface to points (Q, 3)."""
 
     samples: Callable[[float, int], SurfaceSamples]
     nearest_surface: Callable[[Float64], Float64]
@@ -45,7 +45,7 @@ class Shape:
 
 
 def splats_on(shape: Shape, spacing: float, *, is_inset: bool, seed: int) -> tuple[Float64, Float64]:
-    """Centres (N, 3) and radii (N,) [m] that cover a shape, as float32 keeps them.
+    """Centres (N, 3) and radii (N,) [m] that cover a shape, rounded to float32.
 
     Centres on the surface with radius 0; or (`is_inset`) inside, with the largest ball up to spacing / sqrt 2 that
     touches the surface from within.
@@ -65,7 +65,7 @@ def splats_on(shape: Shape, spacing: float, *, is_inset: bool, seed: int) -> tup
 
 
 def shapes(*, with_meshes: bool = True) -> list[Shape]:
-    """Box, ball and table, and the meshes of the folder that SPLATCTRL_REAL_DATA names, where there is one."""
+    """Box, ball and table, and the meshes in the folder SPLATCTRL_REAL_DATA, if set."""
     made = [
         _of_primitives("box", _box((0.30, 0.20, 0.16), (0.0, 0.0, 0.0))),
         _of_primitives("ball", _solid("sphere", (0.15,), (0.0, 0.0, 0.0))),
@@ -89,7 +89,7 @@ def mesh_folder() -> Path:
 
 
 def points_around(shape: Shape, num: int, lower: float, upper: float, *, seed: int) -> tuple[Float64, Float64]:
-    """Points (num, 3) even in space where the true distance is in [lower, upper) [m], and that distance (num,)."""
+    """Points (num, 3) uniform in space with true distance in [lower, upper) [m], and their distances (num,)."""
     rng = np.random.default_rng(seed)
     found: list[Float64] = []
     while sum(map(len, found)) < num:
@@ -136,7 +136,7 @@ def _part(solid: Primitive, others: list[Primitive]) -> Part:
 
 
 def _samples(solid: Primitive, others: list[Primitive], spacing: float, seed: int) -> SurfaceSamples:
-    """Samples of a fine mesh of the solid, moved onto the solid, without those where another solid touches it."""
+    """Samples of the solid's fine mesh, moved onto the solid, without samples where another solid touches it."""
     drawn = sample_mesh(_mesh_of(solid), spacing, seed=seed)
     points = closest_point(solid, transform_points(solid.T_world_shape, drawn.points))[1]
     if others:
@@ -177,7 +177,9 @@ def _solid(kind: str, size: tuple[float, ...], middle: tuple[float, float, float
 
 @dataclass(frozen=True, kw_only=True)
 class LoneSplat:
-    """A splat before a wall [m]: how far before it, the wall's spacing, the radius of all, and l of the kernel."""
+    """A splat before a wall [m]: its distance from the wall, the wall's spacing, the radius of all, and the kernel's
+    l.
+    """
 
     wall: float
     spacing: float
@@ -206,7 +208,7 @@ LONE_SPLATS = tuple(
 def lone_splat(distance: float, *, wall_spacing: float, radius: float) -> tuple[Float64, Float64]:
     """One splat at the origin and a wall of splats, a square of 40 cm at x = -`distance` [m]: centres, radii.
 
-    Row sums give the splat the weight of one in a crowd, as the wall lies within its kernel.
+    Row sums weight the splat as if it had neighbours, because the wall lies within its kernel.
     """
     axis = np.arange(-0.2, 0.2 + 0.5 * wall_spacing, wall_spacing)
     y, z = np.meshgrid(axis, axis, indexing="ij")
@@ -216,7 +218,7 @@ def lone_splat(distance: float, *, wall_spacing: float, radius: float) -> tuple[
 
 
 def random_balls(num: int, *, seed: int) -> tuple[Float64, Float64]:
-    """Balls in a cube of 2 m with radii from 1 mm to 30 cm, even in their logarithm: centres (N, 3), radii (N,)."""
+    """Balls in a cube of 2 m with log-uniform radii from 1 mm to 30 cm: centres (N, 3), radii (N,)."""
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-1.0, 1.0, (num, 3)).astype(np.float32).astype(np.float64)
     radii = 10.0 ** rng.uniform(-3.0, np.log10(0.3), num)

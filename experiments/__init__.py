@@ -1,1 +1,1 @@
-"""The paper's experiments, run by ``python -m experiments``. They use the package's public names alone."""
+"""The paper's experiments, run by ``python -m experiments``. They use only the package's public names."""

@@ -26,7 +26,7 @@ ABOUT = {
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """A word of the command line: what it does, its options, and what runs it and returns the exit code."""
+    """A subcommand: its description, its options, and the function that runs it and returns the exit code."""
 
     about: str
     add_options: Callable[[argparse.ArgumentParser], None]
@@ -62,7 +62,7 @@ def add_study_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a study, merge what was made of one, or run one problem of it."""
+    """Run a study, merge a study's tables, or run one of its problems."""
     if args.problem is not None:
         return _run_one(args)
     request = StudyRequest(

@@ -1,6 +1,4 @@
-"""What each mechanism is worth: a recording whose truth is known, with each of them off, one at a time; and the table
-of what its absence changes, over the same recordings.
-"""
+"""Ablation: recordings with known truth, with each mechanism off in turn, and the table of the changes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -68,9 +66,8 @@ TOLERATED = 0.005  # [m] below the margin that is no false green
 @dataclass(frozen=True, kw_only=True)
 class Measured(FittedRow):
     """A recording without a mechanism; what does not apply is None. psnr [dB], depth [m], in_front: of held-out
-    pixels that a training view saw; fit_s [s]. audit, loop: labels of the verdicts by the map alone, on the recorded
-    motion and on that which the controller drives; with the least clearance [m] of each, true_clearance and
-    loop_clearance. margin [m].
+    pixels that a training view saw; fit_s [s]. audit, loop: labels of the map's verdicts on the recorded and on the
+    driven motion. true_clearance, loop_clearance [m]: their least true clearances. margin [m].
     """
 
     depth: float | None = None
@@ -92,23 +89,23 @@ class Measured(FittedRow):
         return self.audit
 
     def false_greens(self) -> int:
-        """Of the two motions, those that were called safe nearer to something than the margin."""
+        """Number of the two motions that were called safe, though nearer to something than the margin."""
         judged = ((self.audit, self.true_clearance), (self.loop, self.loop_clearance))
         return sum(word == SAFE and d is not None and d < self.margin - TOLERATED for word, d in judged)
 
     def false_collisions(self) -> int:
-        """Of the two motions, those that were called contact or too near and kept the margin."""
+        """Number of the two motions that were called contact or too near, though they kept the margin."""
         judged = ((self.audit, self.true_clearance), (self.loop, self.loop_clearance))
         return sum(word in ("contact", "margin broken") and d is not None and d >= self.margin for word, d in judged)
 
     @property
     def is_false_green(self) -> bool:
-        """With every mechanism on: without one it is what the study looks for."""
+        """True for a false green with every mechanism on. With one off, the study looks for false greens."""
         return self.method == ALL and self.false_greens() > 0
 
     @property
     def success(self) -> bool:
-        """Whether it ran, and the closed loop, where there is one, reached its goal without touching anything."""
+        """True if it ran, and its closed loop, if any, reached the goal without contact."""
         touched = self.loop_clearance is not None and self.loop_clearance < 0.0
         return not self.error and self.reached is not False and not touched
 
@@ -132,12 +129,12 @@ class Measured(FittedRow):
 
 
 def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
-    """Environment and number of all, or of at most `trials` of each."""
+    """Environment and number of all problems, or of at most `trials` of each environment."""
     return [(name, n) for name, most in NUM_PROBLEMS.items() for n in range(min(most, trials or most))]
 
 
 def measured(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Measured]:
-    """The recording of a name through the mechanisms, each off in turn. Raises InputError for a name that is none."""
+    """Results on the named recording with each mechanism off in turn. Raises InputError for an unknown name."""
     environment, number = named(request.problem, NUM_PROBLEMS, "environment")
     elsewhere = OF_MOTION if environment == SCAN else STILL_ALONE
     with TemporaryDirectory() as name:
@@ -155,7 +152,7 @@ def measured(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> I
 
 
 def _record(out: Path, environment: str, number: int, width: int) -> None:
-    """A table with a visitor whose place and time the number draws, or a scan."""
+    """Record a table with a visitor at a place and time drawn from `number`, or a scan."""
     options = RecordingOptions(width=width, height=width * 3 // 4, seed=number)
     if environment == SCAN:
         simulate(SimulateRequest(out=out, options=replace(options, duration_s=0.6), dtu=True))
@@ -232,7 +229,7 @@ Value = Callable[[Measured], float | None]
 
 
 def sections(trials: Sequence[Measured]) -> Iterator[tuple[str, Sequence[str], Rows]]:
-    """Title, header and rows for each kind of recording: absolute figures with everything on, then differences."""
+    """Title, header and rows for each kind of recording: figures with every mechanism on, then differences."""
     for environment, title in TITLES.items():
         of = [trial for trial in trials if trial.environment == environment]
         if of:
@@ -311,7 +308,7 @@ def _times(found: Sequence[Measured], beside: Mapping[int, Measured] | None) -> 
 
 
 def _gives(trials: Sequence[Measured], method: str) -> bool:
-    """Whether anything but time differs without it, beyond chance, on any kind of recording."""
+    """True if a figure other than fit time differs without `method`, beyond chance, on any recording."""
     values: tuple[Value, ...] = (lambda t: t.psnr, lambda t: t.depth, lambda t: t.in_front, lambda t: t.loop_s)
     for environment in TITLES:
         beside = {t.number: t for t in trials if t.environment == environment and t.method == ALL}

@@ -1,7 +1,7 @@
-"""The paper's baselines beside the closed loop on one recorded task: a planner, and a monitored standstill (Fig. 8).
+"""The closed loop and the paper's baselines on one recorded task: a planner, and a monitored standstill (Fig. 8).
 
-The closed loop is that of `splatctrl replay`; every method starts where and when it does, has its goal, and is
-measured in the scene as it was known at each time.
+The closed loop is `splatctrl replay`'s. Every method has its start, start time and goal, and is measured in the scene
+known at each time.
 """
 
 import argparse
@@ -108,7 +108,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive the closed loop, then every baseline, and write what came of them."""
+    """Drive the closed loop, then every baseline, and write the results."""
     zone = _zone(args) if STANDSTILL in args.methods else None
     request, stopwatch = _request(args), Stopwatch()
     with output_path(args.out, force=args.force, is_folder=True) as folder:
@@ -141,8 +141,8 @@ def side_by_side(
 ) -> SideBySide:
     """Run every method and measure it, with the closed loop and the log, in the scene known at each time.
 
-    A standstill is held by `zone`. Our controller, in place of the user's, leaves a replay of its own in `folder`.
-    Paths are planned in the scene known at the start, and begin there as if planning took no time.
+    `zone` stops a standstill. If our controller replaces the user's, it writes its own replay to `folder`. Paths are
+    planned in the scene known at the start, and begin at once, as if planning took no time.
     """
     control, task = request.config.control, _task(request, closed)
     people = {} if zone is None else separations(closed, zone, human)
@@ -174,7 +174,7 @@ def _key(name: str) -> str:
 
 
 def _task(request: ReplayRequest, closed: ReplayResult) -> ReplayTask:
-    """Return the closed loop's task. Without a goal posture, the logged one at the end is where the search begins."""
+    """Return the closed loop's task. Without a goal posture, the search begins at the last logged posture."""
     model, logged_end = closed.inputs.model, closed.inputs.motion().position[-1]
     stamps, positions, _ = _trace(closed)
     frame = request.frame or model.frame_names[-1]
@@ -199,7 +199,7 @@ def _stamps(start_ns: int, num: int, period: float) -> Stamps:
 
 
 def _driven(closed: ReplayResult) -> Motion:
-    """The motion of a closed loop; where a user's own controller intervened is not known."""
+    """The motion of a closed loop; interventions of a user's controller are unknown."""
     stamps, positions, steps = _trace(closed)
     shaped = np.array([is_shaped(step) for step in steps], dtype=np.bool_)
     is_ours = closed.replay.outside is None
@@ -251,7 +251,7 @@ def _yardstick(closed: ReplayResult, task: ReplayTask) -> Yardstick:
 
 
 def separations(closed: ReplayResult, zone: StopZone, human: Sequence[str]) -> dict[str, Separation]:
-    """The closed loop and the standstill beside people, from the same moment."""
+    """Separations from people of the closed loop and the standstill, from the same time on."""
     inputs, config = closed.inputs, closed.replay.config
     people, control = people_of(closed, human), config.control
     stamps, positions, steps = _trace(closed)
@@ -279,7 +279,7 @@ def separations(closed: ReplayResult, zone: StopZone, human: Sequence[str]) -> d
 
 
 def people_of(closed: ReplayResult, human: Sequence[str]) -> DistanceToPeople:
-    """The people of the truth where it is given, else those that the scene labels human, for `human.memory` [s]."""
+    """People of the truth, if given; else splats labelled human in the scene, for `human.memory` [s]."""
     scene, truth = closed.inputs.scene, closed.inputs.truth
     if truth is not None:
         wanted = human or PEOPLE
@@ -306,7 +306,7 @@ def people_of(closed: ReplayResult, human: Sequence[str]) -> DistanceToPeople:
 
 
 def _request(args: argparse.Namespace) -> ReplayRequest:
-    """The closed loop. Raises UsageError for methods or people that need what is not given."""
+    """The closed loop's request. Raises UsageError for methods or people that need missing options."""
     if QP_IK in args.methods and args.controller is None and args.controller_command is None:
         raise UsageError(
             f"--methods {QP_IK}: the closed loop is that already",
@@ -327,7 +327,7 @@ def _request(args: argparse.Namespace) -> ReplayRequest:
 
 
 def _zone(args: argparse.Namespace) -> StopZone:
-    """The zone of --zone or --zone-box. Raises UsageError for values that do not make one."""
+    """The zone of --zone or --zone-box. Raises UsageError for invalid values."""
     try:
         stop, resume = (float(part) for part in args.zone.split(","))
     except ValueError:

@@ -1,6 +1,6 @@
-"""Where 3D Gaussian splatting adds Gaussians and where it removes them (Kerbl et al. 2023, section 5).
+"""Rules by which 3D Gaussian splatting adds and removes Gaussians (Kerbl et al. 2023, section 5).
 
-Arrays grow and shrink: each function returns new ones. New Gaussians start without moments.
+Each function returns new arrays, longer or shorter. New Gaussians start without moments.
 """
 
 from dataclasses import dataclass, fields
@@ -55,7 +55,7 @@ class GaussianSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Densified:
-    """What one round did: Gaussians cloned, split (each into two), unmet for lack of room, and removed by reason.
+    """Result of one round: numbers of Gaussians cloned, split (each into two), without room, and removed by reason.
 
     Reasons: broken (not finite), opacity, screen (too large in an image), size (too large in the world).
     """
@@ -84,8 +84,8 @@ def densify(
     """One round: clone, split, prune; growth statistics start again.
 
     A Gaussian whose mean screen gradient reaches `densify_gradient` is cloned if its largest sigma is at most
-    `dense_share` of the scene's `extent` [m], else split. Where `max_gaussians` leaves too little room, the largest
-    gradients have it.
+    `dense_share` of the scene's `extent` [m], else split. If `max_gaussians` leaves too little room, the largest
+    gradients take precedence.
     """
     wanted, num_unmet = _wanted(arrays, settings)
     is_small = _largest_sigma(arrays.parameters) <= settings.dense_share * extent
@@ -105,7 +105,9 @@ def densify(
 
 
 def split_parts(parameters: Float32, shrink: float, rng: np.random.Generator) -> Float32:
-    """Two Gaussians for each of parameters (N, 59): centres drawn from it, sigmas divided by `shrink`; (2N, 59)."""
+    """Two Gaussians for each of parameters (N, 59): (2N, 59), with centres drawn from the Gaussian and sigmas divided
+    by `shrink`.
+    """
     parts = np.repeat(parameters, SPLIT_PARTS, axis=0)
     local = rng.standard_normal((len(parts), 3)) * np.exp(parts[:, LOG_SCALE])
     parts[:, CENTER] += np.einsum("nij,nj->ni", rotations(parts[:, QUAT]), local).astype(np.float32)
@@ -116,7 +118,7 @@ def split_parts(parameters: Float32, shrink: float, rng: np.random.Generator) ->
 def prune_reasons(
     arrays: GaussianArrays, settings: GaussianSettings, extent: float, *, prunes_large: bool
 ) -> dict[str, Bool]:
-    """Masks (N,) of what is to be removed, by reason; a Gaussian has one at most."""
+    """Masks (N,) of Gaussians to remove, by reason; each Gaussian has at most one reason."""
     p = arrays.parameters
     nothing = np.zeros(len(p), bool)
     found = {
@@ -134,14 +136,16 @@ def prune_reasons(
 
 
 def reset_opacity(arrays: GaussianArrays, opacity: float) -> None:
-    """Lower every opacity to at most `opacity`, in place, and forget its moments: what the images need comes back."""
+    """Lower every opacity to at most `opacity`, in place, and reset its moments; training raises needed opacities
+    again.
+    """
     np.minimum(arrays.parameters[:, LOGIT], np.float32(_logit(opacity)), out=arrays.parameters[:, LOGIT])
     arrays.first[:, LOGIT] = 0.0
     arrays.second[:, LOGIT] = 0.0
 
 
 def rotations(quats_wxyz: NDArray[np.floating]) -> Float64:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length but zero."""
+    """Rotation matrices (N, 3, 3) of nonzero quaternions (N, 4)."""
     q = quats_wxyz.astype(np.float64)
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     return np.stack(
@@ -155,7 +159,7 @@ def rotations(quats_wxyz: NDArray[np.floating]) -> Float64:
 
 
 def _wanted(arrays: GaussianArrays, settings: GaussianSettings) -> tuple[Bool, int]:
-    """The Gaussians (N,) to clone or split, and how many more found no room; each adds one."""
+    """Mask (N,) of Gaussians to clone or split, and the number without room; each adds one Gaussian."""
     gradient = arrays.growth[:, GRADIENT_SUM] / np.maximum(arrays.growth[:, NUM_VIEWS], 1.0)
     wanted = gradient >= settings.densify_gradient
     room = max(settings.max_gaussians - len(arrays), 0)

@@ -1,4 +1,4 @@
-"""A task in a drawn environment: a start, a goal and a way between them, found among the true solids."""
+"""A task in a random environment: a start, a goal and a path between them among the true solids."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -35,8 +35,8 @@ MOVING = 0.88  # of a recording; the rest is at its ends
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """waypoints (W, J) [rad] from start to goal, no nearer to anything than `TASK_CLEARANCE`; T_world_goal
-    (4, 4) of the arm's tip. num_refused: pairs of places without a way between them, and environments without any.
+    """waypoints (W, J) [rad] from start to goal, no nearer to anything than `TASK_CLEARANCE`; T_world_goal (4, 4) of
+    the arm's tip. num_refused: pairs of places without a path between them, and environments without any path.
     """
 
     environment: Environment
@@ -57,8 +57,8 @@ class Task:
 
 
 def task_of(kind: str, seed: int, model: RobotModel) -> Task:
-    """The task that a seed draws in one of `ENVIRONMENTS`; raises InputError where an arm finds none in
-    `TASK_ENVIRONMENTS` environments.
+    """The task that a seed draws in one of `ENVIRONMENTS`; raises InputError if `TASK_ENVIRONMENTS` environments have
+    no task.
     """
     num_refused = 0
     for attempt in range(TASK_ENVIRONMENTS):
@@ -95,7 +95,7 @@ def _solid(primitive: Primitive) -> Solid:
 def _pairs(
     environment: Environment, room: Clearance, model: RobotModel
 ) -> Iterator[tuple[Float64, Float64, Float64]]:
-    """A start (J,), goals (G, J) that are one pose of the tip, and that pose, of places that are apart."""
+    """Yield a start (J,), goals (G, J) of one tip pose, and that pose, for places far apart."""
     tip, guesses = (
         model.frame_names[-1],
         np.array([model.middle, *random_postures(model, TASK_GUESSES, seed=0)]),

@@ -1,4 +1,4 @@
-"""IV-A on a DTU tree: our fit at three budgets beside 3D Gaussian splatting, same views, losses and iterations."""
+"""IV-A on a DTU tree: our fit at three budgets and 3D Gaussian splatting, with equal views, losses and iterations."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -38,8 +38,8 @@ NAMES = {**{name: f"ours, {count:,} splats" for name, count in BUDGETS.items()},
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(FittedRow):
-    """A method on a scan: held-out views by the protocol's figure (over the mask where there is one), psnr [dB], and
-    over seen pixels; depth [m], the median error there; None where it has no value.
+    """A method on a scan: psnr [dB] of held-out views by the protocol (over the mask, if any). psnr_seen [dB] and
+    depth [m], the median error: over seen pixels. None: no value.
     """
 
     psnr_seen: float | None = None
@@ -77,7 +77,7 @@ class Fit(FittedRow):
 
 
 def problems(trials: int | None, root: Path | None) -> list[tuple[str, int]]:
-    """The scans of a tree by number, those of the published means first; without one the simulated scan by seed.
+    """The scans of a tree by number, those of the published means first; without a tree, the simulated scan by seed.
 
     Raises InputError for a tree without a scan.
     """
@@ -91,7 +91,7 @@ def problems(trials: int | None, root: Path | None) -> list[tuple[str, int]]:
 
 
 def trials_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Fit]:
-    """A scan through the methods. Raises InputError for a name that is none, or not in the tree."""
+    """Fits of a scan by all methods. Raises InputError for an unknown name, or one not in the tree."""
     root, (environment, number) = request.problems, named(request.problem, (GIVEN, SIMULATED), "environment")
     if environment == GIVEN and root is None:
         raise InputError(f"--problem {request.problem}: is of a DTU tree", remedy="give its folder with --problems")
@@ -147,7 +147,7 @@ HEADER = ("", "scans", "PSNR [dB]", "95 %", "seen [dB]", "SSIM", "depth error [m
 
 
 def sections(trials: Sequence[Fit]) -> Iterator[tuple[str, Sequence[str], Sequence[Sequence[str]]]]:
-    """Title, header and rows: the means over scans, the paper's beside them, and each budget less the baseline."""
+    """Title, header and rows: means over scans, the paper's figures, and each budget minus the baseline."""
     rows: list[Sequence[str]] = [
         (f"{about.name} (the paper)", "", f"{about.psnr:.2f}", "", "", "", "", about.splats, "")
         for about in fits.METHODS.values()

@@ -1,7 +1,7 @@
-"""Environments drawn by a seed: things on one or two tables, a shelf of openings, a shelf with a divider taken out.
+"""Environments drawn by a seed: objects on one or two tables, a shelf with openings, a shelf without a divider.
 
-They are of the kinds that Motion Policy Networks (Fishman et al., CoRL 2022) plans in; that work's problems and
-parameters are not to be had, so these are our own. World frame: z up, the arm's base at the origin, x forward.
+Their kinds are those of Motion Policy Networks (Fishman et al., CoRL 2022). The parameters are ours, because that
+work's are not available. World frame: z up, the arm's base at the origin, x forward.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ EYES = (  # [m] beside the base and looking forward, to the sides, and before it
 
 @dataclass(frozen=True, kw_only=True)
 class Environment:
-    """What stands there, and poses (4, 4) that a tip may start from and go to, z away from the arm."""
+    """Primitives, and poses (4, 4) for the tip's start and goal, with z away from the arm."""
 
     primitives: tuple[Primitive, ...]
     places: tuple[Float64, ...]
@@ -55,7 +55,7 @@ def drawn(kind: str, rng: np.random.Generator) -> Environment:
 
 
 def ring_of_cameras(num: int, width: int, height: int) -> tuple[Camera, ...]:
-    """The first of six cameras about the arm, with the lens of a RealSense D435's depth camera (87 degrees wide)."""
+    """The first of six cameras about the arm, with the lens of a D435's depth camera (87 degrees wide)."""
     focal = 0.5 * width / np.tan(np.radians(87) / 2)
     lens = Intrinsics(
         fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height
@@ -67,7 +67,7 @@ def ring_of_cameras(num: int, width: int, height: int) -> tuple[Camera, ...]:
 
 
 def _tabletop(rng: np.random.Generator) -> Environment:
-    """3 to 15 boxes and cylinders of 5 to 40 cm on a table, or on two in an L; the tip above the tables."""
+    """3 to 15 boxes and cylinders of 5 to 40 cm on a table, or on two in an L; the tip is above them."""
     tables = [(np.array([rng.uniform(0.35, 0.45), 0.0]), np.array([1.5, 1.5]), 0.0)]
     if rng.random() < 0.5:
         place = np.array([0.30, rng.choice([-0.60, 0.60])])
@@ -107,7 +107,9 @@ def _tabletop(rng: np.random.Generator) -> Environment:
 
 
 def _shelf(rng: np.random.Generator, *, is_merged: bool) -> Environment:
-    """2x2 to 3x3 openings of 20 to 40 cm on a table, turned to the arm but for a yaw; the tip inside an opening."""
+    """2x2 to 3x3 openings of 20 to 40 cm on a table, facing the arm up to a yaw; the tip's places are inside
+    openings.
+    """
     columns, rows = (int(n) for n in rng.integers(2, 4, 2))
     widths = np.minimum(rng.uniform(0.20, 0.40, columns), 1.0 / columns)
     heights = np.minimum(rng.uniform(0.20, 0.40, rows), 0.9 / rows)

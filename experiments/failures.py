@@ -1,4 +1,4 @@
-"""Why a trial of Table II failed, as a picture: where it touched, stalled or was blocked, and what was known."""
+"""Why a trial of Table II failed, as a picture: the place of contact, stall or block, and the map there."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +19,9 @@ DIRECTIONS = 300  # that are tried for a view
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """A trial without success: which one, its cause, the verdict and its reason; position (T, J), None where nothing
-    was driven; things: balls, centers (N, 3) and radii (N,) [m], that the map has, and scene, the distance to it,
-    None where there is none.
+    """A trial without success: its label, cause, verdict and reason. position (T, J): None if nothing was driven.
+    things: the map's balls, centers (N, 3) and radii (N,) [m]. scene: distance to the map. Both are None without a
+    map.
     """
 
     problem: Problem
@@ -36,7 +36,7 @@ class Failure:
 
 
 def draw(failure: Failure, path: Path) -> None:
-    """Write two views of it, one from afar and one close to the place, from where that is seen."""
+    """Write two views of a failure: one from afar, one close to its place with a free line of sight."""
     at, eyes = _place(failure), np.array([frame.T_world_camera[:3, 3] for frame in failure.views.steps[0]])
     middle = np.mean([at.point, failure.problem.model.base_position, eyes.mean(axis=0)], axis=0)
     views = [
@@ -73,7 +73,7 @@ def _scene(failure: Failure, at: judge.Contact, eyes: Float64) -> drawn.TrialSce
 
 
 def _shown(problem: Problem, centers: Float32, radii: Float32) -> tuple[Float32, Float32]:
-    """At most `BALLS` of balls (N, 3), (N,): of those that the arm reaches, evenly by their order."""
+    """At most `BALLS` of balls (N, 3), (N,): evenly chosen, by their order, from balls that the arm reaches."""
     is_near = np.linalg.norm(centers - problem.model.base_position, axis=1) < problem.model.reach()
     number = np.flatnonzero(is_near)
     kept = number[:: max(-(-len(number) // BALLS), 1)]
@@ -88,9 +88,7 @@ def _balls(link: str, centers: Float32 | Float64, radii: Float32 | Float64) -> l
 
 
 def _place(failure: Failure) -> judge.Contact:
-    """The deepest contact with the truth; else, of where the arm ended or what was blocked, the sphere that the map
-    is nearest to.
-    """
+    """The deepest contact with the truth; else the sphere nearest to the map at the arm's end or blocked posture."""
     problem = failure.problem
     if failure.position is not None and failure.cause in (judge.HIT_SEEN, judge.HIT_UNSEEN, judge.HIT_SELF):
         return judge.deepest_contact(problem, failure.position)
@@ -107,7 +105,7 @@ def _place(failure: Failure) -> judge.Contact:
 
 
 def _free_direction(failure: Failure, at: judge.Contact, length: float) -> Float64:
-    """(3,) from which the place is seen best: past things and the arm, and across the way that the contact faces."""
+    """Direction (3,) with the freest view of the place, past objects and arm, and across the contact's direction."""
     number = np.arange(DIRECTIONS) + 0.5
     height, turn = 1 - 1.3 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number  # not from below
     across = np.sqrt(1 - height**2)
@@ -129,7 +127,7 @@ def _free_direction(failure: Failure, at: judge.Contact, length: float) -> Float
 
 
 def _caption(failure: Failure, at: judge.Contact) -> str:
-    """Which trial, cause, verdict, and how far the sphere is from things by the truth and by the map."""
+    """Text: trial, cause, verdict, and the sphere's distances from objects by truth and map."""
     problem, model = failure.problem, failure.problem.model
     center, radius = model.sphere_centers(at.q)[[at.sphere]], float(model.sphere_set.radii[at.sphere])
     name = sphere_names(model.sphere_set)[at.sphere]

@@ -43,7 +43,7 @@ OWN = ("psnr", "splats", "memory", "seconds")
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """Its name, the ending of its metrics, and the paper's figures on DTU: PSNR [dB] and Gaussians."""
+    """A method: name, suffix of its metrics, and the paper's figures on DTU, PSNR [dB] and Gaussians."""
 
     name: str
     key: str
@@ -78,8 +78,8 @@ COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """One method on one scan: its scene, the peak memory [MiB] of this process during the fit (None where the system
-    does not tell), and the score of its views.
+    """One method on one scan: its scene, this process's peak memory [MiB] during the fit (None if unknown), and the
+    score of its views.
     """
 
     scan: str
@@ -89,7 +89,7 @@ class Fitted:
     score: JudgedResult
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; psnr [dB] by the protocol: over the mask where there is one."""
+        """Plain values; psnr [dB] by the protocol, over the mask if there is one."""
         metrics = self.score.metrics
         return {
             "scan": self.scan,
@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _request(args: argparse.Namespace) -> FitRequest:
-    """The request with its defaults; the options' settings outrank their iterations, but not their splats."""
+    """The request with its defaults. Values of --set override --iterations, but not --splats."""
     is_dtu = args.recording.is_dir()
     if not is_dtu and args.protocol is None:
         raise UsageError(f"fits {args.recording}: needs a protocol", remedy="give --protocol holdout:2,5")
@@ -177,9 +177,9 @@ def known_scans(root: Path) -> list[str]:
 
 
 def fit_scans(request: FitRequest) -> dict[str, Any]:
-    """Fit both methods to each scan, score them alike, and write what was asked for; everything in plain values.
+    """Fit both methods to each scan, score them alike, and write outputs to `out`, if given; return plain values.
 
-    Raises InputError where a reconstruction does not end well, other SplatCtrlError for what cannot be scored.
+    Raises InputError if a reconstruction fails, other SplatCtrlError if scoring is impossible.
     """
     scans, out = _scans(request.recording), request.out
     fits: list[Fitted] = []
@@ -227,8 +227,8 @@ def _with_scan(recording: RecordingRequest, scan: str) -> RecordingRequest:
 def _fit(
     request: FitRequest, recording: RecordingRequest, method: str, out: Path
 ) -> tuple[JudgedResult, float | None]:
-    """The scene of one method, and the peak memory [MiB] of this process during the fit, None where the system does
-    not tell. Raises InputError with what it says where it does not end well.
+    """The scene of one method, and this process's peak memory [MiB] during the fit, None if unknown. Raises
+    InputError with the verdict's sentence if the fit fails.
     """
     out.parent.mkdir(parents=True)
     has_peak = _forget_peak_memory()
@@ -250,7 +250,7 @@ def _fit(
 
 
 def _forget_peak_memory() -> bool:
-    """Let the peak memory of this process begin anew; False where the system does not do that."""
+    """Reset this process's peak memory; return False if the system cannot."""
     gc.collect()
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
@@ -301,7 +301,7 @@ def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
 
 
 def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
-    """The methods beside the paper's figures, each fit, and what belongs to the figures."""
+    """Lines of the methods and the paper's figures, each fit, and notes on the figures."""
     settings, protocol, fits = report["settings"], report["protocol"], report["fits"]
     yield from _lines_of_methods(report)
     yield "paper's: its section IV-A, on scans, views, sizes and iterations that it does not name; the rest: here"

@@ -1,6 +1,6 @@
 """3D Gaussian splatting (Kerbl et al. 2023) on RGB-D views: the baseline of the fixed-budget method.
 
-It shares seeds, targets, loss and rasteriser with `SceneFitter`; what differs is the method.
+It shares seeds, targets, loss and rasteriser with `SceneFitter`; only the method differs.
 """
 
 import math
@@ -45,9 +45,8 @@ NOTHING_DONE = Densified(cloned=0, split=0, unmet=0, pruned=dict.fromkeys(("brok
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianAuditRow:
-    """What happened up to `iteration`: number of Gaussians then, loss (image part of eq. 4) and PSNR [dB] over the
-    iterations since the row before, and what densification did. The last row's figures are of the finished set over
-    all views.
+    """State at `iteration`: number of Gaussians, loss (image part of eq. 4) and PSNR [dB] since the previous row, and
+    results of densification. The last row's figures are the finished set's over all views.
     """
 
     iteration: int
@@ -63,10 +62,10 @@ class GaussianAuditRow:
 
 
 class GaussianFitter:
-    """Fits a growing set of anisotropic Gaussians to views of a scene that stands still.
+    """Fits a growing set of anisotropic Gaussians to views of a static scene.
 
-    The same views and seed give the same bytes at any thread count. Raises InputError where no view has a depth
-    inside the workspace: the first Gaussians come from there.
+    The same views and seed give the same bytes at any thread count. Raises InputError if no view has depth inside the
+    workspace, because the first Gaussians need it.
     """
 
     def __init__(
@@ -107,7 +106,9 @@ class GaussianFitter:
         return min(int(self.num_iterations / max(g.degree_every * g.iterations, 1.0)), g.max_degree)
 
     def fit(self, audit: Callable[[GaussianAuditRow], None] = lambda _: None) -> GaussianAuditRow:
-        """Run all iterations; `audit` gets a row after each round of densification, and the last one, returned."""
+        """Run all iterations; `audit` gets a row after each round of densification, and the last row, which is
+        returned.
+        """
         g = self.settings
         rng = np.random.default_rng([self.seed, 0])
         for view in _schedule(self.views, g.iterations, rng):
@@ -135,7 +136,7 @@ class GaussianFitter:
         self.num_iterations += 1
 
     def _after_iteration(self, rng: np.random.Generator) -> GaussianAuditRow | None:
-        """Densify and reset as the schedule says; the audit row of a round that did."""
+        """Densify and reset by the schedule; return the audit row of a round that did."""
         g, done = self.settings, self.num_iterations
         last = g.densify_until * g.iterations
         is_growing = done < last
@@ -196,7 +197,7 @@ def center_rate(settings: GaussianSettings, iteration: int) -> float:
 def scene_extent(frames: Sequence[RgbdFrame]) -> float:
     """1.1 times the largest distance [m] of a camera from the cameras' mean, as 3DGS has it.
 
-    Cameras that stand together say nothing about the scene: then half the median depth, where that is more.
+    Cameras close together do not show the scene's size; then it is half the median depth, if larger.
     """
     centers = np.array([frame.T_world_camera[:3, 3] for frame in frames])
     spread = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
@@ -228,7 +229,7 @@ def seeded(seeds: SplatSet, opacity: float) -> Float32:
 
 
 def gaussians_of(parameters: Float32, degree: int) -> GaussianSet:
-    """The set that parameters (N, 59) describe, with harmonics up to `degree`; all are objects."""
+    """The splats of parameters (N, 59), with harmonics up to `degree`; all have the label object."""
     quats = parameters[:, QUAT].astype(np.float64)
     harmonics = parameters[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : (degree + 1) ** 2]
     return GaussianSet(

@@ -42,7 +42,7 @@ class TrainingRasteriser(gaussian_kernels.GaussianRasteriser):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianArrays:
-    """Parameters (N, 59), Adam's moments (N, 59), num_steps (N,) uint32, and what densification looks at.
+    """Parameters (N, 59), Adam's moments (N, 59), num_steps (N,) uint32, and densification's statistics.
 
     growth (N, 3): sum of screen gradients |dL/d(u, v)| in units of half an image, the number of views summed, and the
     largest radius on a screen [px] (three sigmas).
@@ -60,8 +60,8 @@ class GaussianArrays:
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianRates:
-    """Learning rates of one step, in the order of the kernels; color is the constant harmonic's, harmonics that of
-    the others.
+    """Learning rates of one step, in the order of the kernels; color: of the constant harmonic; harmonics: of the
+    other harmonics.
 
     regulariser: derivative of lambda_reg times the mean opacity with respect to one opacity.
     """

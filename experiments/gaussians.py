@@ -34,7 +34,7 @@ from splatctrl_cli.blocks import (
 def reconstruct_gaussians(
     request: ReconstructRequest, settings: GaussianSettings | None = None, progress: Progress = SILENT
 ) -> JudgedResult:
-    """Fit, and write the scene folder. Of the request count source, out, force, config, box, seed and threads.
+    """Fit, and write the scene folder. Uses source, out, force, config, box, seed and threads of the request.
 
     Raises UsageError for a recording with a clock.
     """

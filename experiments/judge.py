@@ -1,6 +1,6 @@
-"""What a motion came to: the paper's rule against the truth, and the house's own verdict by what the map knew.
+"""Results of a motion: the paper's rule with the truth, and splatctrl's verdict with the map.
 
-T states, J joints; between two states the joints move straight, and are judged everywhere on the way.
+T states, J joints; between two states, the joints move straight, and every posture between them is judged.
 """
 
 from collections.abc import Iterator
@@ -48,9 +48,9 @@ REQUEST = ReplayRequest(log=Path("trial"), out=Path("trial"))
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """A motion against the truth. cause: of `CAUSES`, empty for a success by the paper's rule; clearance [m]: the
-    least true one of the arm to things on the whole way, at most 0 in collision with one; position_error [m],
-    rotation_error [rad] at its end.
+    """A motion against the truth. cause: of `CAUSES`, "" for a success by the paper's rule. clearance [m]: the arm's
+    least true clearance from objects over the whole motion, at most 0 in collision. position_error [m],
+    rotation_error [rad]: at its end.
     """
 
     cause: str
@@ -65,7 +65,7 @@ class Execution:
 
 
 def against_truth(problem: Problem, position: Float64, views: Views) -> Execution:
-    """A motion (T, J) against the problem's solids: proved free by conservative advancement, not at samples."""
+    """A motion (T, J) against the problem's solids: proved free by conservative advancement, not only at samples."""
     room = Clearance.of(problem.model, problem.solids)
     frame = problem.model.frame_names[-1]
     ends = [problem.model.frame_pose(q, frame) for q in (position[-1], problem.goal)]
@@ -89,8 +89,8 @@ def against_truth(problem: Problem, position: Float64, views: Views) -> Executio
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:
-    """A place of a motion, such as the deepest contact: the posture q (J,), which sphere of the arm, the point (3,)
-    [m], world, that it came to, when, in words, and whether the point is the arm's own.
+    """A place of a motion, such as the deepest contact: the posture q (J,), the number of the arm's sphere, the
+    touched point (3,) [m], world, and the time in words. is_own: the point is the arm's own.
     """
 
     q: Float64
@@ -138,12 +138,12 @@ class MotionSource:
 
 
 def measured(model: RobotModel, config: Config) -> MeasuredRobot:
-    """The robot, with what its spheres leave uncovered, as a verdict wants it."""
+    """The robot with the surface outside its spheres measured, as a verdict needs it."""
     return measured_robot(REQUEST, model, config.control)
 
 
 def verdict_on(robot: MeasuredRobot, position: Float64, stamp_ns: int, known: KnownScene, config: Config) -> Verdict:
-    """The verdict of an audit of a motion (T, J) from a stamp [ns] on, a state each period, by the map alone."""
+    """The verdict of an audit of a motion (T, J) from `stamp_ns` [ns], a state each period, only by the map."""
     period = config.control.period
     stamps = stamp_ns + np.round(np.arange(len(position)) * period * 1e9).astype(np.int64)
     straight = np.zeros_like(position)  # a driven arm moves straight from state to state

@@ -1,7 +1,7 @@
-"""What each method of a study knows of the scene after the cameras' frames: a distance to plan in.
+"""Each method's knowledge of the scene after the cameras' frames: a distance to plan in.
 
-Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one, so that what a planner proves of an
-edge holds of it.
+Q points, world frame, metres. A distance is a lower bound of a 1-Lipschitz one, so that a planner's proof for an edge
+is valid.
 """
 
 from collections.abc import Callable
@@ -60,10 +60,9 @@ TSDF_VOXEL, TSDF_BAND = 0.01, 0.04  # [m] edge of a voxel, and how far from a su
 
 @dataclass(frozen=True, kw_only=True)
 class Map:
-    """scene: what the method takes for things; ways: where a planner may go in it, None for anywhere outside of
-    things. known: what a verdict looks at, barrier: what a controller keeps from; None without. num_parts: splats,
-    voxels or triangles. things: balls, centers (N, 3) and radii (N,) [m], that a picture shows for them; None where
-    there is no map.
+    """scene: distance to the method's obstacles. ways: where a planner may go, None for everywhere outside obstacles.
+    known: a verdict's input, or None. barrier: a controller's field, or None. num_parts: number of splats, voxels or
+    triangles. things: the map's balls for pictures, centers (N, 3) and radii (N,) [m]; None without a map.
     """
 
     scene: HasDistance
@@ -96,7 +95,7 @@ def workspace_of(problem: Problem) -> Box:
 
 
 def splat_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:
-    """Ours: the exact distance to splats and to occupied voxels without one, and what was never seen.
+    """Our map: the exact distance to splats and to occupied voxels without splats, and never-seen space.
 
     The planner's scene is without those that reach into the arm where it stands: what is there is the arm, and a few
     of its pixels that were taken for something else. The verdict's has them. Where a planner may go, lost edges of
@@ -142,8 +141,8 @@ def _less_rounding(field: SphereField) -> DistanceFunction:
 
 
 def barrier_of(problem: Problem, spheres: SplatSet, config: Config, threads: int) -> DistanceField:
-    """The field of a controller over spheres of the map, by the rules of a plan of ours: without those that reach
-    into the arm where it stands; and they yield to the start and the goal, here to their centres at most.
+    """A controller's field over the map's spheres, without spheres that overlap the arm at its start. Spheres near
+    the start and the goal shrink, here at most to their centres.
     """
     kept = spheres.select(is_beside_the_start(problem, spheres.centers, spheres.radii))
     radii = yielded(problem, kept.centers, kept.radii, config.control.margin)
@@ -151,7 +150,7 @@ def barrier_of(problem: Problem, spheres: SplatSet, config: Config, threads: int
 
 
 def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) -> Map:
-    """As IV-B has it: the kernel distance of the splats alone on a grid, interpolated; free is what reads above 0."""
+    """The map of IV-B: the splats' kernel distance on a grid, interpolated; space is free if above 0."""
     fitter = made.fitter
     layout = GridLayout.over(workspace_of(problem), config.field.voxel)
     splats = field_splats(fitter.splats())
@@ -164,7 +163,7 @@ def printed_map(problem: Problem, made: Fitted, config: Config, threads: int) ->
 
 
 def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
-    """An occupancy grid alone: a ball around each occupied voxel that is not the robot's."""
+    """Only an occupancy grid: a ball around each occupied voxel without the robot's voxels."""
     grid = made.fitter.occupancy.grid()
     states = grid.states(config.occupancy.free_below, config.occupancy.occupied_above)
     is_thing = (states == VoxelState.OCCUPIED) & (grid.entity & Label.ROBOT == 0)
@@ -180,7 +179,7 @@ def occupancy_map(made: Fitted, config: Config, threads: int) -> Map:
 
 def gaussian_map(problem: Problem, views: Views, config: Config, threads: int) -> Map:
     """3D-GS, densified as in IV-A, of the frames without the arm's pixels: the distance to balls of its Gaussians'
-    volume. What reaches into the arm where it stands is left out, as of ours.
+    volume. Balls that overlap the arm at its start are omitted, as in our map.
     """
     fitter = GaussianFitter(
         config, workspace_of(problem), without_robot(problem, views, config), seed=problem.number, threads=threads
@@ -232,7 +231,7 @@ def tsdf_map(problem: Problem, views: Views, config: Config) -> Map:
 
 
 def without_robot(problem: Problem, views: Views, config: Config) -> list[RgbdFrame]:
-    """Every frame without what shows the arm: no depth there, and no valid colour."""
+    """Every frame with neither depth nor valid colour on the arm's pixels."""
     return [_without_robot(frame, _posture(problem, step), config) for step in views.steps for frame in step]
 
 

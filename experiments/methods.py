@@ -23,13 +23,13 @@ Values = Mapping[str, float | None]
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """The figures of a motion, None where no path was found to move on, and the plan of a method that plans."""
+    """The figures of a motion, None without a path, and the plan of a method that plans."""
 
     figures: MotionFigures | None = None
     plan: PlannedPath | None = None
 
     def values(self) -> Values:
-        """Every figure by name (`MOTION`, and `PLAN` of a plan); None where it has no value."""
+        """Every figure by name (`MOTION`, and `PLAN` of a plan); None if it has no value."""
         return _motion_values(self.figures) | ({} if self.plan is None else _plan_values(self.plan))
 
 
@@ -114,8 +114,8 @@ class SideBySide:
 
 
 def clearance_picture(path: Path, clearance: Mapping[str, Float64], period: float, margin: float) -> None:
-    """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s], with its least value
-    marked, the end of each as a bar, and the margin [m] as a line. Gaps (NaN) stay gaps.
+    """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s]. Its least value is
+    marked; each motion's end is a bar, and the margin [m] a line. NaN leaves gaps.
     """
     with drawn_figure(path, 4.8) as figure:
         axes = figure.subplots()
@@ -143,7 +143,7 @@ def clearance_picture(path: Path, clearance: Mapping[str, Float64], period: floa
 
 
 def _table(columns: Mapping[str, Values]) -> list[str]:
-    """Lines of a table with a column each, of the figures that any of them has."""
+    """Lines of a table: a column per method, a row per figure that any method has."""
     names = dict.fromkeys(name for values in columns.values() for name in values)
     found = {name: [values.get(name) for values in columns.values()] for name in names}
     there = {name: values for name, values in found.items() if any(value is not None for value in values)}

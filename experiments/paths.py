@@ -1,4 +1,4 @@
-"""Paths of straight edges in joint space (IV): lengths, the clearance proved along one, and its last stretch.
+"""Paths of straight edges in joint space (IV): lengths, the proved clearance along a path, and its final approach.
 
 W waypoints, J joints, K samples.
 """
@@ -29,7 +29,7 @@ APPROACH_TURN = 0.5  # [rad] of a joint between two of them, at most
 
 @dataclass(frozen=True, kw_only=True)
 class PathClearance:
-    """The least clearance of a whole path lies in [lower, upper] [m]; upper is that of a posture of the path."""
+    """The least clearance of a path lies in [lower, upper] [m]; upper is the clearance of one of its postures."""
 
     lower: float
     upper: float
@@ -50,10 +50,10 @@ def effector_length(model: RobotModel, postures: Float64, frame: str) -> tuple[f
 
 
 def least_clearance(clearance: Clearance, waypoints: Float64, *, tolerance: float = 1e-3) -> PathClearance:
-    """The least clearance of the path, everywhere on it and not only at samples, to a tolerance [m].
+    """The least clearance of the whole path, not only at samples, to a tolerance [m].
 
     Over half an interval no row loses more than half of what it can lose over the whole: the bound of conservative
-    advancement, here as branch and bound. Raises InputError where the tolerance asks for too many pieces.
+    advancement, here as branch and bound. Raises InputError if the tolerance needs too many pieces.
     """
     motion = np.diff(waypoints, axis=0)
     speeds = np.maximum(clearance.speeds(motion), fixed.STILL_ROW)

@@ -1,4 +1,4 @@
-"""A cube to carry into a bowl, among things that a seed draws: four layouts at three heights, as in IV-C.
+"""A cube to carry into a bowl, among random objects: four layouts at three heights, as in IV-C.
 
 World frame as in `tabletop`: z up, the table's top at z = 0, the arm's base at the origin, x forward. The cube stands
 on the left, alone or on a block, the bowl on the right.
@@ -41,7 +41,7 @@ class PickAndPlace:
 
 
 def drawn_scene(layout: str, number: int, attempt: int) -> PickAndPlace:
-    """The scene of a layout and a number, which chooses the height; another attempt at it is another scene."""
+    """The scene of a layout and a number, which chooses the height; each attempt draws another scene."""
     rng = np.random.default_rng([LAYOUTS.index(layout), number, attempt])
     pick, bowl = (np.array([rng.uniform(0.42, 0.52), side * rng.uniform(0.30, 0.40)]) for side in (1, -1))
     base = rng.uniform(0.04, 0.10) * (rng.random() < 0.5)
@@ -100,7 +100,7 @@ def _things(layout: str, heights: tuple[float, float], taken: Taken, rng: np.ran
 def _thing(
     name: str, heights: tuple[float, float], taken: Taken, rng: np.random.Generator, about: Float64 | None = None
 ) -> Iterator[Primitive]:
-    """A box, cylinder or ball where there is room for it, about a place or anywhere."""
+    """A box, cylinder or ball at a free place, near `about` or anywhere."""
     kind, height = rng.choice(["box", "box", "cylinder", "cylinder", "ball"]), rng.uniform(*heights)
     width, depth = rng.uniform(0.05, 0.15, 2)
     if kind == "ball":
@@ -118,7 +118,7 @@ def _thing(
 
 
 def _stack(name: str, heights: tuple[float, float], taken: Taken, rng: np.random.Generator) -> Iterator[Primitive]:
-    """Two or three boxes one upon the other, each smaller than the one below."""
+    """Two or three stacked boxes, each smaller than the box below."""
     width, depth = rng.uniform(0.12, 0.18, 2)
     spot = _spot(0.5 * float(np.hypot(width, depth)), taken, rng, None)
     if spot is None:
@@ -132,7 +132,7 @@ def _stack(name: str, heights: tuple[float, float], taken: Taken, rng: np.random
 
 
 def _spot(radius: float, taken: Taken, rng: np.random.Generator, about: Float64 | None) -> Float64 | None:
-    """A place (2,) for a circle [m] beside those that are taken, among which it is from then on; None without any."""
+    """A free place (2,) [m] for a circle, which is added to `taken`; None if no place is free."""
     for _ in range(60):
         spot = rng.uniform(*REGION)
         if about is not None:

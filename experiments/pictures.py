@@ -34,9 +34,7 @@ SPREAD = 0.16  # of the space between two methods, over which the trials of one 
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """values (T, M) of the trials by method, NaN where a method has none; level: a value to draw a line at, and what
-    it is.
-    """
+    """values (T, M) of the trials by method, NaN if missing; level: value of a line to draw, and its name."""
 
     title: str
     values: Float64
@@ -46,7 +44,7 @@ class Panel:
 def trials_picture(
     path: Path, methods: Sequence[str], panels: Sequence[Panel], groups: Sequence[str], title: str
 ) -> None:
-    """Write panels side by side; groups (T,): what the trials are told apart by, a colour each."""
+    """Write panels side by side; groups (T,): group of each trial; each group has a colour."""
     colors = dict(zip(dict.fromkeys(groups), CURVE_COLORS, strict=False))
     with drawn_figure(path, HEIGHT) as figure:
         for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -108,9 +106,9 @@ LENS = Intrinsics(fx=480.0, fy=480.0, cx=(SIZE[0] - 1) / 2, cy=(SIZE[1] - 1) / 2
 
 @dataclass(frozen=True, kw_only=True)
 class TrialScene:
-    """Surfaces in the world frame, each link of the name of a colour: solid ones, and light ones that shine through
-    where they are nearer. is_seen: whether a camera measured something at points (Q, 3); place (3,) [m]: what to
-    look at; cameras (C, 3) [m].
+    """Surfaces in the world frame, each link with the name of a colour. solid: opaque surfaces; light: translucent
+    surfaces. is_seen: True for points (Q, 3) that a camera measured; place (3,) [m]: point to look at; cameras (C, 3)
+    [m].
     """
 
     solid: RobotSurface
@@ -121,7 +119,7 @@ class TrialScene:
 
 
 def trial_picture(path: Path, scene: TrialScene, views: Sequence[tuple[str, Float64, Float64]], caption: str) -> None:
-    """Write views side by side, each a title, its eye (3,) and what it looks at (3,) [m]; the caption above."""
+    """Write views side by side, each with title, eye (3,) and target (3,) [m]; the caption is above."""
     with drawn_figure(path, 6.2, caption) as figure:
         for axes, (title, eye, target) in zip(figure.subplots(1, len(views)), views, strict=True):
             T_world_camera = look_at(eye, target)
@@ -165,14 +163,14 @@ def _layer(
 
 
 def _everywhere(is_seen: Callable[[Float64], Sequence[bool]], points_world: Float64, is_asked: Bool) -> Bool:
-    """What was seen (H, W) of points (H, W, 3), asked at every second pixel of both directions."""
+    """Seen points (H, W) of points (H, W, 3), evaluated at every second pixel in both directions."""
     coarse = np.ones(is_asked[::2, ::2].shape, bool)
     coarse[is_asked[::2, ::2]] = is_seen(points_world[::2, ::2][is_asked[::2, ::2]])
     return coarse.repeat(2, axis=0).repeat(2, axis=1)[: is_asked.shape[0], : is_asked.shape[1]]
 
 
 def _shade(points: Float64, shades: int) -> Float64:
-    """(H, W) in (0, 1]: bright where a surface faces the camera, in so many steps."""
+    """Brightness (H, W) in (0, 1] in `shades` steps; a surface that faces the camera is bright."""
     across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
     normal = np.cross(across, down)
     facing = np.abs(np.sum(normal * points, axis=2))
@@ -182,7 +180,7 @@ def _shade(points: Float64, shades: int) -> Float64:
 
 
 def _mark(axes: "mpl.axes.Axes", scene: TrialScene, T_world_camera: Float64) -> None:
-    """A ring about the place, whatever hides it, and the numbers of the cameras that are in the picture."""
+    """Draw a ring about the place, even if hidden, and the numbers of the cameras in the picture."""
     T_camera_world = invert_transform(T_world_camera)
     u, v = project(LENS, transform_points(T_camera_world, scene.place[None])[0])
     axes.plot(u, v, "o", markersize=22, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.2)

@@ -1,5 +1,5 @@
-"""One problem of a study as a run of its own: its trials as rows of a table, written and read back to the value, and
-the verdict that no green one was false.
+"""One problem of a study as a separate run. Its trials are rows of a table, written and read without loss; its
+verdict is that no green trial was false.
 """
 
 import csv
@@ -26,11 +26,11 @@ FLAGS = {"True": True, "False": False}
 
 
 class Row(Protocol):
-    """A trial: a frozen dataclass of words, numbers and flags, some of them None where there is no such thing.
+    """A trial: a frozen dataclass of words, numbers and flags; missing values are None.
 
-    verdict: the house's label, empty without one; is_false_green: judged safe, and something was touched; cause: of
-    its failure, empty for a success; true_clearance [m]: the least on the whole way; label: which trial it is; told:
-    what came of it, in a few words.
+    verdict: splatctrl's label, or "". is_false_green: judged safe, though something was touched. cause: of its
+    failure, "" for a success. true_clearance [m]: the least over the whole motion. label: names the trial. told: its
+    result in a few words.
     """
 
     @property
@@ -53,7 +53,7 @@ R = TypeVar("R", bound=Row)
 
 
 def verdict_on_trials(trials: Sequence[Row]) -> Verdict:
-    """Fail where a trial that was judged safe touched something. Without a trial nothing is judged."""
+    """Fail if a trial that was judged safe touched something. Without trials, nothing is judged."""
     if not trials:
         return verdict_of("study", [])
     judged = [trial for trial in trials if trial.verdict]
@@ -91,7 +91,7 @@ def write_trials(path: Path, trials: Sequence[Row], kind: type[Row]) -> None:
 
 
 def read_trials(path: Path, kind: type[R]) -> list[R]:
-    """What `write_trials` wrote. Raises InputError for a file that is not that, or not as it was written."""
+    """Read trials from `write_trials`. Raises InputError for another or a changed file."""
     types = _columns(kind)
     try:
         with path.open(encoding="utf-8", newline="") as stream:
@@ -134,10 +134,10 @@ Section = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Generic[R]):
-    """An experiment of the paper, whose trials are rows of a kind. problems: environment and number, of at most so
-    many of each (None: all), with those of a folder; archive: that folder, by --problems; archived: the environments
-    that are in it; trials: those of a problem, whose `out` is the folder that is being written; sections: tables of
-    all trials; notes: sentences below them; draw: their figure, into a file.
+    """An experiment of the paper, whose trials are rows of a kind. problems: environments and numbers, at most so
+    many of each (None: all), with a folder's. archive: this folder, by --problems. archived: environments in the
+    folder. trials: of a problem, whose `out` is the folder being written. sections: tables of all trials. notes:
+    sentences below them. draw: writes their figure to a file.
     """
 
     row: type[R]
@@ -153,7 +153,7 @@ class Study(Generic[R]):
     draw: Callable[[Sequence[R], Path], None] | None = None
 
     def methods_of(self, given: Sequence[str]) -> tuple[str, ...]:
-        """The methods that are asked for, or all that are installed. Raises UsageError for one that is none."""
+        """The given methods, or all installed methods. Raises UsageError for an unknown method."""
         for name in given:
             if name not in self.methods:
                 raise UsageError(f"--methods {name}: expected some of {', '.join(self.methods)}")
@@ -170,7 +170,7 @@ class ProblemResult:
 
 
 def run_problem(study: Study[R], request: ProblemRequest, progress: Progress = SILENT) -> ProblemResult:
-    """Run it; the same request leaves the same table. Raises InputError for one that its study does not have."""
+    """Run a problem; the same request gives the same table. Raises InputError for an unknown problem."""
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         trials = list[R]()
         for trial in study.trials(replace(request, out=folder), study.config, Stopwatch()):

@@ -1,5 +1,5 @@
-"""The problems of a study: drawn environments by their seed, and those of MotionBenchMaker from their archive; and
-what its cameras see of one: an arm at rest, through depth cameras that stand nearly where they say.
+"""The problems of a study: environments drawn by a seed, and MotionBenchMaker's from an archive. Also their cameras'
+views of an arm at rest, with slightly wrong poses.
 """
 
 import os
@@ -75,7 +75,7 @@ class ProblemRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class FittedRow:
-    """Which problem and method a row of a study of fits is of, why it failed, and its held-out views' psnr [dB]."""
+    """A row of a study of fits: problem, method, reason of a failure, and psnr [dB] of held-out views."""
 
     environment: str
     number: int
@@ -86,7 +86,7 @@ class FittedRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """From a posture to another (J,) [rad] among things, world frame; number: the seed of a drawn one."""
+    """A motion between two postures (J,) [rad] among objects, world frame; number: the seed of a random problem."""
 
     environment: str
     number: int
@@ -131,7 +131,7 @@ def archive_of(given: Path | None) -> Path | None:
 
 
 def named(name: str, kinds: Collection[str], kind: str) -> tuple[str, int]:
-    """What a problem's name, KIND-NUMBER, says: one of `kinds`, and which. Raises InputError for another name."""
+    """Kind (one of `kinds`) and number in a problem's name, KIND-NUMBER. Raises InputError for another name."""
     first, _, number = name.rpartition("-")
     if first not in kinds or not number.isdecimal():
         raise InputError(f"--problem {name}: expected {kind.upper()}-NUMBER", remedy=f"{kind}s: {', '.join(kinds)}")
@@ -162,7 +162,7 @@ def read_problem(name: str, archive: Path | None) -> Problem:
 
 
 def room() -> list[Primitive]:
-    """Floor and walls: without them a camera that looks past the things gets no depth, and nothing is known there."""
+    """Floor and walls, so that a camera that looks past the objects gets depth."""
     return [
         Primitive(
             name=name,
@@ -281,14 +281,14 @@ class Views:
         return [frame for step in self.steps for frame in step]
 
     def has_seen(self, points_world: Float64) -> list[bool]:
-        """Whether a camera measured something within `SEEN_WITHIN` of points (Q, 3)."""
+        """Mask (Q,) of points (Q, 3) with a camera's measurement within `SEEN_WITHIN`."""
         measured = np.concatenate([_points(frame) for frame in self.steps[0]])
         away = cKDTree(measured).query(points_world)[0] if len(measured) else np.full(len(points_world), np.inf)
         return [bool(each <= SEEN_WITHIN) for each in np.asarray(away)]
 
 
 def views_of(problem: Problem, num_cameras: int, *, width: int, num_steps: int) -> Views:
-    """What the first cameras of the ring see, with noise, and poses as a calibration has them."""
+    """Views of the first cameras of the ring, with noise, and pose errors like a calibration's."""
     cameras = ring_of_cameras(num_cameras, width, 3 * width // 4)
     arm = solids_at(problem.model, problem.start)
     return recorded(cameras, problem.primitives, arm, seed=problem.number, num_steps=num_steps)
@@ -308,7 +308,7 @@ def recorded(
     num_steps: int,
     first: int = 0,
 ) -> Views:
-    """Time steps of frames from the step `first` on, with the noise and the errors of the poses that a seed draws."""
+    """Time steps of frames from the step `first` on, with noise and pose errors drawn by `seed`."""
     images = [Renderer(camera, primitives, color_rays=0).image(arm) for camera in cameras]
     calibrated = Perturbation(pose_error=POSE_ERROR, pose_turn=POSE_TURN, seed=seed)
     poses = [calibrated.pose(camera.name, camera.T_world_camera) for camera in cameras]

@@ -1,4 +1,4 @@
-"""Shares of trials that succeed, means of figures of trials: intervals, and whether two methods differ in pairs."""
+"""Shares of successful trials and means of figures, with intervals, and paired comparisons of two methods."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
-    """num_successes of num trials, and the interval from low to high that has the true share with `CONFIDENCE`."""
+    """num_successes of num trials, and the interval [low, high] that contains the true share with `CONFIDENCE`."""
 
     num_successes: int
     num: int
@@ -27,7 +27,7 @@ class Share:
 
 
 def share_of(num_successes: int, num: int) -> Share:
-    """A share with Wilson's score interval (Wilson 1927), which stays within 0 and 1; of no trial: all of that."""
+    """A share with Wilson's score interval (Wilson 1927), which stays in [0, 1]; [0, 1] without trials."""
     if not num:
         return Share(num_successes=0, num=0, low=0.0, high=1.0)
     z = float(norm.ppf(0.5 + CONFIDENCE / 2))
@@ -40,8 +40,8 @@ def share_of(num_successes: int, num: int) -> Share:
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """Of trials that two methods both had: how many only the first, and only the second, succeeded in; p_value: of
-    McNemar's exact test that neither is better.
+    """Pairs of trials of two methods: numbers of pairs in which only the first, or only the second, succeeded.
+    p_value: McNemar's exact test that neither is better.
     """
 
     num: int
@@ -51,9 +51,7 @@ class Paired:
 
 
 def paired(outcomes: Sequence[tuple[bool, bool]]) -> Paired:
-    """McNemar's test, exact (binomial, two-sided), of pairs of successes (first, second); p is 1 without a pair that
-    differs.
-    """
+    """McNemar's test, exact (binomial, two-sided), of pairs of successes (first, second); p is 1 if none differ."""
     first = sum(a and not b for a, b in outcomes)
     second = sum(b and not a for a, b in outcomes)
     p_value = min(1.0, 2.0 * float(binom.cdf(min(first, second), first + second, 0.5))) if first + second else 1.0
@@ -61,7 +59,7 @@ def paired(outcomes: Sequence[tuple[bool, bool]]) -> Paired:
 
 
 def mean_between(values: Sequence[float]) -> tuple[float, float, float]:
-    """The mean, and the interval that has the true one with `CONFIDENCE` by Student's t; NaN of too few."""
+    """The mean, and the interval of the true mean with `CONFIDENCE` by Student's t; NaN for too few values."""
     if not values:
         return math.nan, math.nan, math.nan
     mean, num = float(np.mean(values)), len(values)
@@ -72,8 +70,8 @@ def mean_between(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def signed_rank(differences: Sequence[float]) -> tuple[str, str, str, str]:
-    """Of differences within pairs, in words: the mean, its interval, how many are above 0, and the p of Wilcoxon's
-    signed ranks (two-sided; NaN of fewer than five, or where none differs).
+    """Text on differences within pairs: the mean, its interval, how many are above 0, and the two-sided p of
+    Wilcoxon's signed ranks. p is NaN for fewer than five pairs, or if none differs.
     """
     mean, low, high = mean_between(differences)
     p = float(wilcoxon(differences).pvalue) if len(differences) > 4 and np.any(differences) else math.nan

@@ -1,4 +1,4 @@
-"""Record an arm in a scene that a seed draws: on tables, at a shelf, or beside a person's arm; with its truth."""
+"""Record an arm in a random scene, with its truth: on tables, at a shelf, or near a person's arm."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The scenes of IV-C as problems: a way to a cube, and from there into a bowl, which is known to exist.
+"""The scenes of IV-C as problems, with known paths to a cube and from there to a bowl.
 
 J joints.
 """
@@ -35,7 +35,7 @@ POSTURES = 6  # at a pose
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What stands there, the arm, and postures (J,) [rad] over cube and bowl between which there is a way.
+    """The objects, the arm, and postures (J,) [rad] over cube and bowl with a path between them.
 
     num_refused: scenes of its name that were drawn before it and have none.
     """
@@ -54,11 +54,11 @@ class Scene:
         return self.model.carrying([(HAND, HELD)])
 
     def to_cube(self) -> Problem:
-        """From home to where the hand is over the cube, which is a thing."""
+        """The problem from home to over the cube, which is an obstacle."""
         return self._problem(self.model, (*self.drawn.things, self.drawn.cube), np.array(HOME), self.hover)
 
     def to_bowl(self, start: Float64) -> Problem:
-        """From over the cube's place, with the cube as part of the arm, to over the bowl."""
+        """The problem from over the cube's place to over the bowl, with the cube as part of the arm."""
         return self._problem(self.carrying, self.drawn.things, start, self.place)
 
     def _problem(self, model: RobotModel, things: Sequence[Primitive], start: Float64, goal: Float64) -> Problem:
@@ -68,9 +68,9 @@ class Scene:
 
 
 def read_scene(name: str) -> Scene:
-    """The scene of a name, LAYOUT-NUMBER: the first that is drawn for it in which the true solids leave a way.
+    """The scene of a name, LAYOUT-NUMBER: the first draw with a path among the true solids.
 
-    Raises InputError for a name that is none.
+    Raises InputError for an unknown name.
     """
     layout, number = named(name, LAYOUTS, "layout")
     model = simulated_arm()
@@ -91,13 +91,13 @@ def read_scene(name: str) -> Scene:
 
 
 def problems(trials: int | None, archive: Path | None) -> list[tuple[str, int]]:
-    """Layout and number of the twelve scenes, or of at most so many of each layout."""
+    """Layout and number of the twelve scenes, or of at most `trials` of each layout."""
     num = len(HEIGHTS) if trials is None else min(trials, len(HEIGHTS))
     return [(layout, number) for layout in LAYOUTS for number in range(num)]
 
 
 def _ends(drawn: PickAndPlace, model: RobotModel) -> tuple[Float64, Float64] | None:
-    """Postures over cube and bowl with a way from home over the first to the second; None without one."""
+    """Postures over cube and bowl with a path from home over the cube to the bowl; None without one."""
     carrying, home = model.carrying([(HAND, HELD)]), np.array(HOME)
     before = Clearance.of(model, solids_of([*drawn.things, drawn.cube, *room()]), margin=ROOM)
     after = Clearance.of(carrying, solids_of([*drawn.things, *room()]), margin=ROOM)
@@ -116,5 +116,5 @@ def _ends(drawn: PickAndPlace, model: RobotModel) -> tuple[Float64, Float64] | N
 
 
 def _free(postures: Float64, *rooms: Clearance) -> Float64:
-    """Those of postures (G, J) that are free in every one of the rooms."""
+    """The postures of (G, J) that are free in all rooms."""
     return postures[[all(room.at(q[None])[0] > SPARE for room in rooms) for q in postures]]

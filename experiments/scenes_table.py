@@ -1,4 +1,4 @@
-"""Twelve scenes, two controllers (IV-C, Fig. 7): success, lengths of the ways, and the least distance on them."""
+"""Twelve scenes, two controllers (IV-C, Fig. 7): success, lengths of the paths, and their least distances."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

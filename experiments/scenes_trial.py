@@ -1,6 +1,6 @@
-"""One scene of IV-C: the arm is driven to a cube, takes it, and carries it into a bowl, by each method twice.
+"""One scene of IV-C: the arm is driven to a cube, takes it, and carries it into a bowl, twice by each method.
 
-The map is made of what the cameras saw with the arm at home, and goes on with what they see once the cube is lifted:
+The map begins with the cameras' views with the arm at home. It continues with their views after the cube is lifted;
 then its place is empty, and the cube is part of the arm. T states, J joints.
 """
 
@@ -54,10 +54,10 @@ RANKS = {Outcome.PASSED: 0, Outcome.NOT_EVALUABLE: 1, Outcome.FAILED: 2}
 class Transport:
     """One run of a method in a scene; a row of what is published.
 
-    success: the cube is over the bowl, by the paper's rule, and nothing was touched; verdict: the worse of the two
-    ways', by the map alone and the paper's 2 cm; true_clearance, field_clearance [m]: the least over both ways of the
-    arm and what it carries to the true solids and to the map, between the states, too. Lengths are of both ways,
-    errors at the end of the last. in_known_space: both ways keep out of space that no camera saw; None if unplanned.
+    success: the cube is over the bowl, by the paper's rule, and nothing was touched. verdict: the worse of both legs'
+    verdicts, only by the map and the paper's 2 cm. true_clearance, field_clearance [m]: the least of the arm and its
+    load from the true solids and from the map, over both legs and between states. Lengths are sums of both legs;
+    errors are at the last leg's end. in_known_space: both legs avoid never-seen space; None if unplanned.
     """
 
     layout: str
@@ -94,7 +94,7 @@ class Transport:
 
 @dataclass(frozen=True, kw_only=True)
 class Leg(Rig):
-    """A way in a scene: to a pose of the hand, with the home posture to lean to."""
+    """A leg of a task: to a pose of the hand, with the home posture as preferred posture."""
 
     @property
     def task(self) -> ReplayTask:
@@ -110,7 +110,7 @@ class Leg(Rig):
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """What became of one leg: its motion (T, J), and the row's figures of it."""
+    """Result of one leg: its motion (T, J), and its figures of the row."""
 
     position: Float64
     outcome: str
@@ -123,7 +123,7 @@ class Way:
 
 
 def transports_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Transport]:
-    """Every run of the scene with a name. Raises InputError for one that is none."""
+    """Every run of the named scene. Raises InputError for an unknown name."""
     with stopwatch.stage("scene"):
         scene = read_scene(request.problem)
     width, threads = request.width, request.threads
@@ -133,7 +133,7 @@ def transports_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch)
 
 
 class Trial:
-    """One run in a scene: what the cameras saw at first, which is the same for every method."""
+    """One run in a scene, with the first camera views, the same for every method."""
 
     def __init__(
         self, *, scene: Scene, run: int, config: Config, width: int, threads: int, stopwatch: Stopwatch
@@ -148,7 +148,7 @@ class Trial:
             self._views = self._seen(problem, np.array(HOME), ())
 
     def by(self, method: str) -> Transport:
-        """The run of a method; what cannot be done at all is one without success, with its reason."""
+        """The run of a method; an impossible run is unsuccessful, with its reason."""
         scene = self._scene
         row = Transport(
             layout=scene.layout,
@@ -166,7 +166,7 @@ class Trial:
         return _with_ways(replace(row, success=not cause, cause=cause, outcome=outcome), ways, period)
 
     def _driven(self, method: str, ways: list[Way]) -> tuple[str, str]:
-        """Both legs, added to `ways`: the cause of a failure, empty without one, and how the last leg ended."""
+        """Drive both legs and add them to `ways`; return the cause of a failure, or "", and the last leg's end."""
         scene, config, problem = self._scene, self._config, self._scene.to_cube()
         workspace = workspace_of(problem)
         fitter = SceneFitter(config.scene, config.occupancy, workspace, seed=self._seed, threads=self._threads)
@@ -221,8 +221,8 @@ class Trial:
             )
 
     def _not_taken(self, hover: Float64) -> str:
-        """The hand goes straight down about the cube, and up again with it: the same for every method, judged by the
-        truth without the cube, for contact with that is meant. Why it cannot, empty where it can.
+        """Move the hand straight down around the cube, and up again with it, alike for every method; return why this
+        fails, or "". It is judged by the truth without the cube, because contact with the cube is intended.
         """
         scene = self._scene
         down = goal_postures(
@@ -236,7 +236,7 @@ class Trial:
         return "" if is_free else HIT_GRASPING
 
     def _seen(self, problem: Problem, q: Float64, held: Sequence[Primitive]) -> Views:
-        """What the cameras see of a problem with the arm at q (J,), and what it holds."""
+        """Camera views of a problem with the arm at q (J,) and the objects that it holds."""
         arm = [*solids_at(problem.model, q), *held]
         first = NUM_STEPS if held else 0
         return recorded(self._cameras, problem.primitives, arm, seed=self._seed, num_steps=NUM_STEPS, first=first)
@@ -244,7 +244,7 @@ class Trial:
     def _fitted(
         self, fitter: SceneFitter, views: Views, q: Float64, carried: Sequence[tuple[str, Box]] = ()
     ) -> list[AuditRow]:
-        """Take in views with the arm at q (J,), and boxes that it carries, which count as its own."""
+        """Fit views with the arm at q (J,) and carried boxes, which count as parts of the arm."""
         return [
             fitter.step(step, posture_of(self._scene.model, q, {frame.stamp_ns: q for frame in step}, carried))
             for step in views.steps
@@ -258,13 +258,13 @@ def _held_cube(scene: Scene, q: Float64) -> Primitive:
 
 
 def _clearance(model: RobotModel, known: Map, position: Float64) -> float:
-    """The least distance [m] of a motion (T, J) to the map, on the whole way."""
+    """The least distance [m] of a whole motion (T, J) to the map."""
     in_map = Clearance.of(model.replace_self_pairs(judge.NO_PAIRS), known.scene)
     return least_clearance(in_map, position, tolerance=5e-4).upper
 
 
 def _with_ways(row: Transport, ways: Sequence[Way], period: float) -> Transport:
-    """The row with what both ways, or the one that there was, came to."""
+    """The row with the results of both legs, or of the only leg."""
     if not ways:
         return row
     worst = max((way.verdict for way in ways), key=lambda verdict: RANKS[verdict.outcome])

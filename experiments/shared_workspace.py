@@ -42,8 +42,8 @@ CUBE = 0.04  # [m]
 
 @dataclass(frozen=True, kw_only=True)
 class Visit:
-    """What a seed decides: the pile (2,) [m] on the table, the shoulder (3,) [m], which side the elbow is out to (1:
-    left), when the hand sets out [s], where the wrist goes (W, 3) [m] and when it is there and leaves (W,) [s].
+    """A seed's visit: the pile (2,) [m] on the table, the shoulder (3,) [m], the elbow's side (1: left), the wrist's
+    places (W, 3) [m], and its times of arrival and departure (W,) [s].
     """
 
     pile: Float64
@@ -65,7 +65,7 @@ class Visit:
 
 
 def visit_of(place: str, seed: int) -> Visit:
-    """The visit of a seed at one of `PLACES`: which side, when, where and how fast (0.3 to 0.6 m/s) are drawn."""
+    """The visit of a seed at one of `PLACES`; side, times, places and speed (0.3 to 0.6 m/s) are random."""
     rng = np.random.default_rng([seed, PLACES.index(place)])
     left = 1.0 if place == "near-pickup" else -1.0
     side = int(rng.choice([-1, 1]))
@@ -94,7 +94,7 @@ def visit_of(place: str, seed: int) -> Visit:
 
 
 def things(place: str, seed: int) -> list[Primitive]:
-    """What stands on the table: the pile, a block where the arm takes, a bowl where it puts down, things between."""
+    """Objects on the table: the pile, a block at the pickup, a bowl at the goal, objects between."""
     rng = np.random.default_rng([seed, PLACES.index(place), 1])
     pile = visit_of(place, seed).pile
     cubes = [
@@ -117,7 +117,7 @@ def things(place: str, seed: int) -> list[Primitive]:
 
 
 def human_arm(visit: Visit, start_ns: int) -> list[Primitive]:
-    """The person's upper arm, forearm and hand as capsules that move, there from the visit's start to its end."""
+    """The person's upper arm, forearm and hand as moving capsules, present from the visit's start to its end."""
     num_knots = int(np.ceil((visit.end_s - visit.start_s) / 0.05)) + 1  # [s] between two poses
     seconds = np.linspace(visit.start_s, visit.end_s, num_knots)
     chains = [_chain(visit, float(second)) for second in seconds]
@@ -142,7 +142,7 @@ def human_arm(visit: Visit, start_ns: int) -> list[Primitive]:
 
 
 def task_motion(visit: Visit) -> Motion:
-    """The logged motion: the task leg by leg, where no leg runs while the person's arm is there."""
+    """The logged motion: the task leg by leg, but no leg while the person's arm is there."""
     times, waypoints, clock = [0.0], [HOME], 0.0
     for before, after in pairwise(TASK):
         depart = clock + PAUSE_S
@@ -155,7 +155,7 @@ def task_motion(visit: Visit) -> Motion:
 
 
 def scene_of(place: str, seed: int) -> Scene:
-    """Return the table with the person's arm at it, whose visit the seed draws."""
+    """Return the table with a person's arm, whose visit the seed draws."""
     visit = visit_of(place, seed)
     person = tuple(human_arm(visit, START_NS))
     return Scene(
@@ -183,7 +183,7 @@ def _chain(visit: Visit, second: float) -> Float64:
 
 
 def _wrist(visit: Visit, second: float) -> Float64:
-    """Where the wrist is (3,) [m]: minimum jerk between its places, at rest in them."""
+    """The wrist's place (3,) [m]: minimum jerk between its places, where it rests."""
     index = int(np.clip(np.searchsorted(visit.arrival_s, second, side="right"), 1, len(visit.wrist) - 1))
     depart, arrive = visit.departure_s[index - 1], visit.arrival_s[index]
     s = float(np.clip((second - depart) / (arrive - depart), 0.0, 1.0))
@@ -192,7 +192,7 @@ def _wrist(visit: Visit, second: float) -> Float64:
 
 
 def _over(place: Float64, height: float) -> Float64:
-    """A wrist (3,) behind a place (2,) on the table, as the hand points on from it."""
+    """The wrist's place (3,) [m] for a hand that reaches a place (2,) on the table."""
     return np.array([place[0] + 0.08, place[1], height])
 
 

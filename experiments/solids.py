@@ -54,7 +54,7 @@ Solid = Ball | Cuboid | Rod
 class Solids:
     """A `DistanceField` of solids: signed distance, negative inside, 1-Lipschitz.
 
-    Inside several: the depth in the deepest. Raises InputError for a size not above zero.
+    Inside several solids, it is the depth in the deepest. Raises InputError for a size not above zero.
     """
 
     solids: Sequence[Solid]

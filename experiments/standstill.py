@@ -1,4 +1,6 @@
-"""The monitored standstill: a path, held while a person is in a zone, as the baseline of IV-E (no compliance)."""
+"""The monitored standstill: the arm stops on its path while a person is in a zone, as the baseline of IV-E (without
+compliance).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,11 +16,11 @@ MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
 ZONE_RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 STOP_ACCELERATION = 7.5  # [rad/s^2] with which the arm brakes and starts (the Panda's)
 DistanceToPeople = Callable[[Float64, int], Float64]
-"""points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
+"""points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf without people."""
 
 
 def remembered(people: DistanceToPeople, age_s: Callable[[int], float], memory: float) -> DistanceToPeople:
-    """The people of maps while they are known: nobody where the map in use at a stamp is older than `memory` [s].
+    """Distance to the map's people; inf if the map used at a stamp is older than `memory` [s].
 
     age_s: stamp [ns] -> the age [s] of that map; NaN where maps have no times, and then they stay.
     """
@@ -38,13 +40,13 @@ class StopZone(Protocol):
     def is_entered(
         self, model: RobotModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
     ) -> bool:
-        """Whether the arm at q (J,) has to hold; one that is held already goes on only after more room."""
+        """True if the arm at q (J,) must stop; a stopped arm (is_held) continues only with more room."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Zone:
-    """The arm stops where a person is nearer than `stop` [m], and goes on where nobody is nearer than `resume`."""
+    """The arm stops if a person is nearer than `stop` [m], and continues if all are farther than `resume` [m]."""
 
     stop: float
     resume: float
@@ -64,7 +66,7 @@ class Zone:
 
 @dataclass(frozen=True, kw_only=True)
 class BoxZone:
-    """The arm stops where a person is in a box, and goes on where nobody is within `hysteresis` [m] of its sides."""
+    """The arm stops if a person is in a box, and continues if all are over `hysteresis` [m] away from it."""
 
     box: Box
     hysteresis: float
@@ -82,7 +84,7 @@ class BoxZone:
 
 
 def is_anybody_in(box: Box, people: DistanceToPeople, stamp_ns: int) -> bool:
-    """Whether a person reaches into a box, or comes as near as `ZONE_RESOLUTION`.
+    """True if a person reaches into a box, or is within `ZONE_RESOLUTION` of it.
 
     A distance changes by no more than a metre per metre: a cell whose middle is farther from everybody than from its
     own corners holds nobody, one whose middle is inside somebody does; the others are cut into eight.
@@ -118,9 +120,7 @@ class Separation:
         return float(self.stamp_ns[-1] - self.stamp_ns[0]) * 1e-9
 
     def figures(self, period: float) -> dict[str, float | None]:
-        """Figures by name of states a period [s] apart; distances over the states at which a person is there, None
-        where nobody ever is.
-        """
+        """Figures by name of states a period [s] apart; distances count states with a person, None without any."""
         there = self.distance[np.isfinite(self.distance)]
         stops = [(end - first) * period for first, end in runs_of(self.is_stopped)]
         return {
@@ -143,8 +143,8 @@ def distance_to_people(model: RobotModel, q: Float64, stamp_ns: int, people: Dis
 
 @dataclass(frozen=True, kw_only=True)
 class Standstill(Separation):
-    """The separation of a path that was held: path_s (T,) [s], the path's own time at each state, and path_speed
-    (T,), how much of it passes per second until the next state: 1 as recorded, 0 held.
+    """The separation of a stopped path. path_s (T,) [s]: the path's time at each state. path_speed (T,): path time
+    per second until the next state, 1 as recorded, 0 stopped.
     """
 
     path_s: Float64 = field(default_factory=lambda: np.zeros(0))
@@ -157,11 +157,11 @@ def monitored_standstill(
 ) -> Standstill:  # fmt: skip
     """The path of `motion` from `start_ns`, time-stretched by every stop; people move in the log's time all along.
 
-    q(t) = path(s(t)) with 0 <= s' <= 1: the arm never leaves the path, and goes on from where it was held. It brakes
-    and starts with |s''| <= max_acceleration / (the path's fastest joint speed), so that no joint changes its speed
-    by more than `max_acceleration` [rad/s^2] on that account; 0 stops it at once, which favours it. With somebody in
-    the zone from the start it stands. After the log's end the last scene stays; a stop that then lasts longer than
-    `max_wait` [s] ends the run.
+    q(t) = path(s(t)) with 0 <= s' <= 1: the arm never leaves the path, and continues from its stop. It brakes and
+    starts with |s''| <= max_acceleration / (the path's fastest joint speed). Thus braking accelerates no joint by
+    more than `max_acceleration` [rad/s^2]; 0 stops the arm at once, which favours it. If a person is in the zone at
+    the start, the arm begins stopped. After the log's end, the last scene stays; a stop longer than `max_wait` [s]
+    then ends the run.
     """
     tick, end_s = round(period * 1e9), (motion.last_ns - start_ns) * 1e-9
     change = np.inf if max_acceleration == 0 else period * max_acceleration / max(_fastest(motion, start_ns), 1e-9)
@@ -191,7 +191,7 @@ def monitored_standstill(
 
 
 def _fastest(motion: LoggedMotion, start_ns: int) -> float:
-    """The fastest joint [rad/s] between any two states of the path from `start_ns` on."""
+    """Largest joint speed [rad/s] between neighbouring states of the path from `start_ns` on."""
     seconds = np.diff(motion.stamp_ns) * 1e-9
     is_used = (seconds > 0) & (motion.stamp_ns[1:] > start_ns)
     moved = np.abs(np.diff(np.asarray(motion.position), axis=0))[is_used]

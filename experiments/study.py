@@ -1,4 +1,4 @@
-"""Run a study: each of its problems once, in processes side by side; then one table of all trials."""
+"""Run a study: each problem once, in parallel processes; then one table of all trials."""
 
 import json
 import multiprocessing
@@ -31,12 +31,12 @@ MOST_NAMED = 5  # problems that are missing
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest:
-    """Run a study into the folder `out`; a second run goes on there.
+    """Run a study into the folder `out`; a second run continues there.
 
-    trials: problems of each environment at most (None: as many as the paper's); problems: MotionBenchMaker's folder
-    (None: that of SPLATCTRL_REAL_DATA, if there is one); methods: of the study, none for all that are installed;
-    width [px] of the images (None: the study's own); shard: (i, n), every n-th problem from the i-th on; made: tables
-    of trials or folders of studies, whose trials are merged instead of running any.
+    trials: most problems of each environment (None: the paper's number). problems: MotionBenchMaker's folder (None:
+    below SPLATCTRL_REAL_DATA, if there). methods: of the study; empty for all installed methods. width [px]: of the
+    images (None: the study's). shard: (i, n), every n-th problem from the i-th on. made: tables of trials or folders
+    of studies to merge, instead of running problems.
     """
 
     study: str
@@ -64,7 +64,8 @@ class StudyResult:
 
 
 def run_study(request: StudyRequest) -> StudyResult:
-    """Run the problems of the shard that have no trials yet. When all have, write ``trials.csv`` and the figure.
+    """Run the shard's problems that have no trials yet. When all problems have trials, write ``trials.csv`` and the
+    figure.
 
     Raises UsageError for a folder of another study or of other settings.
     """
@@ -132,7 +133,7 @@ def _begin(out: Path, asked: Mapping[str, Any]) -> None:
 
 
 def _run_side_by_side(asked: Sequence[ProblemRequest], workers: int) -> dict[str, str]:
-    """Run problems in processes of their own; the messages of those that ended in an error, by name."""
+    """Run problems in separate processes; return error messages by problem."""
     errors: dict[str, str] = {}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
@@ -168,7 +169,7 @@ def _concluded(out: Path, study: Study[Any], trials: Sequence[Row], num_kept: in
 
 
 def _tables(given: Path) -> list[Path]:
-    """Return a table of trials, that of a folder, or where it has none those of its problems."""
+    """Return the path of a table, or of a folder's table, else of its problems' tables."""
     if not given.is_dir() or (given / TRIALS).is_file():
         return [given / TRIALS if given.is_dir() else given]
     found = sorted(given.glob(f"*/{TRIALS}"))

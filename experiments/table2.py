@@ -1,4 +1,4 @@
-"""Table II of the paper (IV-B): success rates with 2, 4 and 6 cameras, the paper's figures beside ours."""
+"""Table II of the paper (IV-B): success rates with 2, 4 and 6 cameras, the paper's and ours."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -70,7 +70,7 @@ def sections(trials: Sequence[Trial]) -> Iterator[tuple[str, Sequence[str], Rows
 
 
 def notes(trials: Sequence[Trial]) -> Iterator[str]:
-    """Which cells are full and which sampled, and what else is to be known of the table."""
+    """Notes on full and sampled cells, and on the table."""
     there = [method for method in METHODS if any(trial.method == method for trial in trials)]
     sampled = [
         f"{name} {count} of {NUM_PROBLEMS[name]}"
@@ -112,7 +112,7 @@ def _averages(trials: Sequence[Trial]) -> Iterator[Sequence[str]]:
 
 
 def _weighted(strata: Mapping[str, Share]) -> str:
-    """A mean over environments by the paper's counts, with an interval from Wilson's of each."""
+    """Mean over environments weighted by the paper's counts, with an interval from each one's Wilson interval."""
     if not all(share.num for share in strata.values()):
         return "-"
     weights = np.array([NUM_PROBLEMS[name] for name in strata], np.float64)

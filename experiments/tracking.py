@@ -1,4 +1,4 @@
-"""A planned path, followed in closed loop: in joint space, or by the QP-IK controller with its barriers."""
+"""Follows a planned path in closed loop: in joint space, or by the QP-IK controller with its barriers."""
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -51,11 +51,11 @@ def follow_with_controller(
     stamp_ns: int = 0,
     scene_step_at: Callable[[int], SceneStep | None] | None = None,
 ) -> tuple[Float64, Sequence[ControlStep]]:
-    """Follow with QP-IK from a stamp [ns] on: its goal is the end effector's pose on the path, as it moves there, and
-    the posture it leans to is the path's.
+    """Follow a path with QP-IK from `stamp_ns` [ns]. Its goal is the path's moving end-effector pose; its preferred
+    posture is the path's.
 
     The path's clock waits while the end effector is `wait_distance` behind. Ends at the goal, or when the clock has
-    stood still for `control.stall_time`. field_at and scene_step_at as in `closed_loop`. Returns the position (T, J)
+    stood still for `control.stall_time`. field_at and scene_step_at: see `closed_loop`. Returns the position (T, J)
     [rad] at every period, and the T - 1 steps between them.
     """
     period = control.period

@@ -1,4 +1,4 @@
-"""One problem of a study through its methods: what each knew, planned and drove, and what that came to."""
+"""One problem of a study by each method: its map, plan, motion and result."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,7 +59,7 @@ NUM_STEPS = 5  # of each camera, the arm at rest
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One method on one problem with so many cameras (0: it needs none); a row of what is published.
+    """One method on one problem with a number of cameras (0: it needs none); a row of the published table.
 
     success: by the paper's rule; verdict: the house's label, empty without one; cause: of `judge.CAUSES`, empty for a
     success; is_false_green: judged safe, and something was touched. true_clearance [m]: the least on the whole way;
@@ -100,7 +100,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What a method did: a motion (T, J), None where cause says why there is none."""
+    """A method's motion (T, J); None without one, for `cause`."""
 
     position: Float64 | None
     cause: str = ""
@@ -124,7 +124,7 @@ class Rig:
 
     @cached_property
     def task(self) -> ReplayTask:
-        """From the start to the tip's pose at the goal; its posture is the first that is tried there."""
+        """The task from the start to the tip's pose at the goal; the goal's posture is tried first."""
         frame = self.problem.model.frame_names[-1]
         return ReplayTask(
             start=self.problem.start,
@@ -149,7 +149,7 @@ Drive = Callable[[Rig, Map], Attempt]
 
 
 def trials_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> Iterator[Trial]:
-    """Every method that a problem goes through, with every number of cameras."""
+    """Trials of a problem by every method, with every number of cameras."""
     with stopwatch.stage("problem"):
         problem = read_problem(request.problem, request.problems)
     has_all = problem.environment in ENVIRONMENTS and problem.number < SUBSET
@@ -174,7 +174,7 @@ def trials_of(request: ProblemRequest, config: Config, stopwatch: Stopwatch) -> 
 
 
 def trial_of(rig: Rig, method: str, num_cameras: int, robot: MeasuredRobot) -> Trial:
-    """One method; what cannot be done at all is a trial without success, with its reason."""
+    """The trial of one method; an impossible trial is unsuccessful, with its reason."""
     problem = rig.problem
     begun = Trial(
         environment=problem.environment,
@@ -232,7 +232,7 @@ def _draw(rig: Rig, trial: Trial, attempt: Attempt | None, known: Map | None) ->
 
 
 def _judged(rig: Rig, trial: Trial, attempt: Attempt, known: Map, robot: MeasuredRobot) -> Trial:
-    """The trial with what its motion came to, against the truth and by what the map knew."""
+    """The trial with its motion's results, by the truth and by the map."""
     position = attempt.position
     assert position is not None
     execution = judge.against_truth(rig.problem, position, rig.views)
@@ -272,8 +272,8 @@ def by_planner(rig: Rig, known: Map) -> Attempt:
 
 
 def _least_unseen(rig: Rig, way: Way, seeds: Sequence[int], *, gives_up: bool) -> Attempt:
-    """Of the plans that samples of these seeds lead to, the one that comes to least space that no camera saw; the
-    first where that is at most `LITTLE`, or is not known. gives_up: none where the first seed leads to none.
+    """Of the seeds' plans, the one through the least never-seen space; the first if this is at most `LITTLE` or
+    unknown. gives_up: return no plan if the first seed has none.
     """
     best, least = Attempt(position=None, cause=judge.NO_PLAN), np.inf
     for seed in seeds:
@@ -295,7 +295,7 @@ def _least_unseen(rig: Rig, way: Way, seeds: Sequence[int], *, gives_up: bool) -
 
 
 def as_printed(rig: Rig, known: Map) -> Attempt:
-    """A planned path that keeps no margin, to the goal from anywhere."""
+    """A planned path without a margin, from the start to the goal."""
     config = replace(rig.config, control=replace(rig.config.control, margin=NO_MARGIN))
     return _planned(rig, known.scene, config, approach=0.0)
 
@@ -311,7 +311,7 @@ def _planned(rig: Rig, scene: HasDistance, config: Config, *, approach: float = 
 
 
 def by_controller(num_detours: int, rig: Rig, known: Map) -> Attempt:
-    """QP-IK from the start to the goal, with so many ways out that are planned where it stalls."""
+    """QP-IK from the start to the goal, with at most `num_detours` planned detours when it stalls."""
     config, model, task = rig.config, rig.problem.model, rig.task
     control = replace(config.control, max_detours=num_detours, solver="daqp")
     assert known.barrier is not None
@@ -323,7 +323,7 @@ def by_controller(num_detours: int, rig: Rig, known: Map) -> Attempt:
 
 
 def _way_out(rig: Rig, known: Map) -> PlanDetour:
-    """Out of a local minimum: by the safest of the map's ways that keep the margin, or else through any space."""
+    """A path out of a local minimum by the map's safest way with the margin, else through any space."""
     margin = rig.config.control.margin
     scenes = [way.scene for way in known.ways() if way.margin == margin] if known.ways is not None else []
 

@@ -48,8 +48,8 @@ ENDS_ROOM = 2 * START_ROOM + 1e-4  # [m] more than the margin, which a start or 
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """A scene to plan in with a margin [m]. in_known_space: it keeps out of what no camera saw, None where the method
-    does not tell that from free space; unseen_on: how much of it [m^3] a motion (T, J) comes to where it does not.
+    """A scene to plan in with a margin [m]. in_known_space: it avoids never-seen space; None if the method cannot
+    tell that from free space. unseen_on: never-seen volume [m^3] on a motion (T, J), if not avoided.
     """
 
     scene: HasDistance
@@ -62,14 +62,14 @@ Ways = Callable[[], Iterator[Way]]
 
 
 def plain_ways(scene: HasDistance, config: Config) -> Iterator[Way]:
-    """Of a map that does not tell unseen space from free space: by the margin alone."""
+    """Ways of a map that cannot tell unseen from free space; only their margins differ."""
     return (Way(scene=scene, margin=share * config.control.margin) for share in (*SHARES, LEAST_SHARE))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """What there is for a planner of a problem: balls, centers (N, 3) and radii (N,) float32 [m], that stand for
-    things, those from num_known on for lost edges; and the grid of what cameras saw.
+    """A planner's surroundings: balls, centers (N, 3) and radii (N,) float32 [m], for objects, from num_known on for
+    lost edges; and the occupancy grid.
     """
 
     problem: Problem
@@ -81,7 +81,7 @@ class Surroundings:
     threads: int = 1
 
     def ways(self) -> Iterator[Way]:
-        """The safest first; each distance is made when it is asked for."""
+        """Ways, the safest first; each distance is computed when needed."""
         margin = self.config.control.margin
         things = [self.things(share * margin) for share in SHARES]
         for unseen, is_known in ((self.unseen, True), (self.unseen_behind, False)):
@@ -98,15 +98,15 @@ class Surroundings:
         return Way(scene=scene, margin=margin, in_known_space=is_known, unseen_on=unseen_on)
 
     def unseen_on(self, position: Float64) -> float:
-        """How much space [m^3] that no camera saw the arm comes to in a motion (T, J), without what it is in at its
-        start or its goal: by voxels, to half of one.
+        """Never-seen volume [m^3] that the arm sweeps in a motion (T, J), without its volume at start and goal. It
+        counts voxels, to half of a voxel.
         """
         ends = self._reached(np.stack([self.problem.start, self.problem.goal]))
         is_new = self._reached(resampled(position, SAMPLES)) & self._never_seen & ~ends
         return float(np.sum(is_new)) * self.grid.voxel**3
 
     def _reached(self, postures: Float64) -> Bool:
-        """Voxels (X, Y, Z) that the arm's moving spheres hold in any of postures (K, J)."""
+        """Voxels (X, Y, Z) that the arm's moving spheres occupy in any of postures (K, J)."""
         model, grid = self.problem.model, self.grid
         is_reached = np.zeros(self._never_seen.shape, dtype=np.bool_)
         moving = np.flatnonzero(model.moving_spheres)
@@ -121,8 +121,8 @@ class Surroundings:
         return is_reached
 
     def things(self, margin: float, *, is_thin: bool = False) -> DistanceFunction:
-        """The distance to the balls, those `yielded` that the start or the goal is nearer to than the margin [m].
-        is_thin: balls of at most `THIN`, and those of lost edges half as large.
+        """The distance to the balls; balls within the margin [m] of start or goal are `yielded`. is_thin: radii are
+        at most `THIN`, and half as large at lost edges.
         """
         radii = self.radii.copy()
         if is_thin:
@@ -136,7 +136,9 @@ class Surroundings:
 
     @cached_property
     def unseen(self) -> DistanceFunction | None:
-        """A lower bound of the distance to space that no camera saw and the arm was not in; None without any."""
+        """Lower bound of the distance to space that no camera saw and the arm did not occupy; None without such
+        space.
+        """
         return self._distance_to(self._is_unseen)
 
     @cached_property
@@ -158,7 +160,7 @@ class Surroundings:
 
     @cached_property
     def _is_unseen(self) -> Bool:
-        """Voxels (X, Y, Z), without those `UNSEEN_NEAR` the arm's start and goal."""
+        """Never-seen voxels (X, Y, Z), without voxels within `UNSEEN_NEAR` of the arm's start and goal."""
         grid, problem, is_unseen = self.grid, self.problem, self._never_seen.copy()
         centers = np.concatenate([problem.model.sphere_centers(q) for q in (problem.start, problem.goal)])
         radii = np.tile(problem.model.sphere_set.radii, 2)
@@ -172,7 +174,7 @@ class Surroundings:
         return is_unseen
 
     def _distance_to(self, chosen: Bool) -> DistanceFunction | None:
-        """Voxels (X, Y, Z) as balls of their width; None for none or all."""
+        """Distance to voxels `chosen` (X, Y, Z) as balls of their width; None if none or all are."""
         grid = self.grid
         if not chosen.any() or chosen.all():
             return None
@@ -194,9 +196,8 @@ def beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> tupl
 
 
 def yielded(problem: Problem, centers: Float32, radii: Float32, margin: float) -> Float32:
-    """Radii (N,) [m] of balls (N, 3), (N,), less where the start or the goal is nearer than the margin [m]: a ball
-    may be as much too large, and what is given is as near as it is. The centre of a ball yields as far as the arm's
-    surface, to -margin, and not inside it.
+    """Radii (N,) [m] of balls (N, 3), (N,), reduced if the start or the goal is nearer than the margin [m], because
+    balls may be too large. A radius is at least -margin, at which the arm may touch the ball's centre.
     """
     for q in (problem.start, problem.goal):
         away = _body(problem, q).query(centers.astype(np.float64))[0]
@@ -205,7 +206,7 @@ def yielded(problem: Problem, centers: Float32, radii: Float32, margin: float) -
 
 
 def is_beside_the_start(problem: Problem, centers: Float32, radii: Float32) -> Bool:
-    """Which of balls (N, 3), (N,) are farther than `START_GAP` from the arm's moving spheres at its start."""
+    """Mask (N,) of balls farther than `START_GAP` from the arm's moving spheres at its start."""
     away = _body(problem, problem.start).query(centers.astype(np.float64))[0] - radii
     return np.asarray(away > START_GAP)
 

@@ -1,6 +1,6 @@
-"""How an arm does its task beside a person: the controller on a map that it makes on the way, and the standstill.
+"""An arm's task near a person: by the controller on a map built during the motion, and by the standstill.
 
-The controller's loop is closed through the cameras: every frame shows the arm where it was driven to. J joints, T
+The controller's loop is closed through the cameras: every frame shows the arm at its driven posture. J joints, T
 states, H x W pixels.
 """
 
@@ -60,8 +60,8 @@ LABEL_ERROR = 2  # [px] that a mask's outline is off by, in or out
 class Drive:
     """A motion of T states, a period apart: position (T, J), is_stopped (T,); is_complete: the task was done.
 
-    num_interventions: intervals in which a scene row shaped the command; relaxed: share of steps where one gave way.
-    known: what the cameras knew on the way, None for a motion without them.
+    num_interventions: intervals in which a scene row changed the command; relaxed: share of steps with a relaxed row.
+    known: the cameras' map during the motion, None without cameras.
     """
 
     position: Float64
@@ -73,7 +73,7 @@ class Drive:
 
 
 class TruthField:
-    """The distance to primitives that stand still, with its gradient."""
+    """The distance to stationary primitives, with its gradient."""
 
     def __init__(self, primitives: Sequence[Primitive]) -> None:
         self._primitives = primitives
@@ -86,7 +86,7 @@ class TruthField:
 
 
 class LiveMap:
-    """The map of what the cameras see, with the fields of every frame so far."""
+    """The map of the camera frames, with the fields of every frame so far."""
 
     def __init__(self, recording: Recording, config: Config, seed: int) -> None:
         self._recording, self._config, self._model = recording, config, recording.robot
@@ -105,7 +105,7 @@ class LiveMap:
         self._rows = list[AuditRow]()
 
     def see(self, index: int, q: Float64) -> DistanceField:
-        """Take in frame `index` of the cameras, with the arm at q (J,); the field to control in."""
+        """Add frame `index` of the cameras, with the arm at q (J,), to the map; return the field for control."""
         frames = [self._labels.on(frame) for frame in self._recording.frames_at(index, q, self._cameras)]
         at_frames = {frame.stamp_ns: q for frame in frames}
         self._rows.append(self._fitter.step(frames, posture_of(self._model, q, at_frames)))
@@ -139,7 +139,7 @@ class LiveMap:
 
 
 class LateLabels:
-    """Masks of people as a segmentation gives them: late, and not quite along the outline."""
+    """Masks of people with a segmentation's errors: late, and with inexact outlines."""
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 5])
@@ -148,7 +148,7 @@ class LateLabels:
         self._disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
 
     def on(self, frame: RgbdFrame) -> RgbdFrame:
-        """The frame with the mask (H, W) of `LABEL_DELAY` frames before, grown or shrunk by `LABEL_ERROR`."""
+        """The frame with the mask (H, W) of `LABEL_DELAY` frames earlier, grown or shrunk by `LABEL_ERROR`."""
         assert frame.human is not None
         masks = [*self._masks.get(frame.camera, [np.zeros_like(frame.human)] * LABEL_DELAY), frame.human]
         self._masks[frame.camera] = masks[1:]
@@ -198,7 +198,7 @@ def driven(
 
 
 def held(model: RobotModel, config: Config, alone: Drive, people: Sequence[Primitive], zone: StopZone) -> Drive:
-    """The path that the controller takes with nobody there, held by a zone that knows the truth about people."""
+    """The controller's path without people, stopped by a zone with the true people."""
     period = config.control.period
     stamps = START_NS + np.rint(np.arange(len(alone.position)) * period * 1e9).astype(np.int64)
     run = monitored_standstill(

@@ -1,5 +1,5 @@
-"""One visit of a person to the table of an arm: what each method did, by the truth and by what its map knew; and the
-tables of all visits, in pairs: a controller beside a person against a monitored standstill (IV, Fig. 8).
+"""One visit of a person to an arm's table: each method's results, by the truth and by its map. Also the paired tables
+of all visits, which compare a controller with a monitored standstill (IV, Fig. 8).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,7 +53,7 @@ NOT_DONE, TOUCHED, PERSON_TOUCHED = "task not done", "collision", "collision wit
 
 @dataclass(frozen=True, kw_only=True)
 class Visit:
-    """What one method did in one trial; a row of what is published.
+    """One method's result in one trial; a row of the published table.
 
     success: the task was done and nothing touched. Distances [m] to the person are those of the moving spheres'
     surfaces by the truth, over the person's whole visit: a finished arm rests at home, an unfinished one goes on.
@@ -97,7 +97,7 @@ class Visit:
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """The recording of a visit, and the task done with nobody there."""
+    """The recording of a visit, and the task done without people."""
 
     place: str
     number: int

@@ -68,10 +68,10 @@ class MotionFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class Yardstick:
-    """What all motions of a task are measured by: the frame and the pose (4, 4) it should reach, and distances.
+    """Measures of all motions of a task: the frame, the pose (4, 4) that it should reach, and distances.
 
-    distances_at names the distances known at a stamp, the controller's own as ``barrier``; certified_at is as
-    `proved_clearance` takes it; truth is None where it is not known.
+    distances_at names the distances known at a stamp, the controller's own as ``barrier``; certified_at: for
+    `proved_clearance`; truth: None if unknown.
     """
 
     model: RobotModel
@@ -105,7 +105,7 @@ class Yardstick:
 
 
 def proved_clearance(model: RobotModel, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
-    """What no moving sphere's distance [m] goes below, at the states and between them; NaN where one is missing.
+    """Lower bound [m] of all moving spheres' distances, at the states and between them; NaN if one is missing.
 
     certified_at gives at a stamp a lower bound of a 1-Lipschitz distance, the same object for the same scene. Half
     of the way to the next state and half of the way from the last one count by the scene of the state: over each, a

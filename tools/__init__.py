@@ -1,1 +1,1 @@
-"""Programs that look for faults in the whole tool. Not part of what is installed."""
+"""Programs that look for faults in the whole tool; they are not installed."""

@@ -1,11 +1,11 @@
 """Plant the bugs of mutants.toml one at a time in a copy of the project, and see whether the tests notice.
 
-``python -m tools.mutants`` prints killed or survived for each, and the share killed by room; ``--room R`` or ``--only
-NAME`` takes some. It ends with 1 where one survived. A test run that takes too long counts as killed.
+``python -m tools.mutants`` prints killed or survived for each bug, and the share killed by room. ``--room R`` or
+``--only NAME`` selects bugs. It ends with 1 if a bug survived. A test run that takes too long counts as killed.
 
-An entry is ``[room.what-is-wrong]`` with `file`, the name of a file below splatctrl_cli/ or experiments/, `old`,
-text that stands there once, `new`, what replaces it, and `tests`, names of test files. They are names, not paths, so
-that files may move.
+An entry is ``[room.what-is-wrong]`` with four keys. `file` is the name of a file below splatctrl_cli/ or
+experiments/; `old` is text that the file contains once. `new` replaces `old`; `tests` are names of test files. Names,
+not paths, let files move.
 """
 
 import argparse
@@ -37,7 +37,7 @@ sys.meta_path[:] = [finder for finder in sys.meta_path if "Redirecting" not in t
 
 @dataclass(frozen=True, kw_only=True)
 class Mutant:
-    """One bug: in `file`, `old` becomes `new`; `tests` are to notice."""
+    """One bug: in `file`, `new` replaces `old`; `tests` should fail."""
 
     room: str
     name: str
@@ -47,7 +47,7 @@ class Mutant:
     tests: Sequence[str]
 
     def place(self, root: Path) -> Path:
-        """The file below `root`. Raises ValueError unless exactly one of that name has the text, once."""
+        """The file below `root`. Raises ValueError unless exactly one file of that name contains `old`, once."""
         places = sorted(path for room in PLANTED for path in (root / room).rglob(self.file))
         counts = {path: path.read_text().count(self.old) for path in places}
         if list(filter(None, counts.values())) != [1]:
@@ -89,7 +89,7 @@ def copied(root: Path = ROOT) -> Iterator[Path]:
 
 
 def tested(copy: Path, files: Sequence[Path], limit_s: float, *, plain: bool = False) -> str:
-    """What became of the tests: `passed`, `failed`, `too slow`, or another end. plain: on the kernels of `build`."""
+    """Result of the tests: `passed`, `failed`, `too slow`, or another end. plain: use the kernels of `build`."""
     command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *map(str, files)]
     environment = os.environ | {"PYTHONPATH": str(copy), "SPLATCTRL_KERNELS": "base" if plain else "auto"}
     try:
@@ -101,7 +101,7 @@ def tested(copy: Path, files: Sequence[Path], limit_s: float, *, plain: bool = F
 
 
 def build(copy: Path) -> str:
-    """Compile the plain kernels of the copy; empty, or the first error."""
+    """Compile the plain kernels of the copy; return the first error, or ""."""
     folder = copy / "build"
     steps = [["cmake", "-S", str(copy), "-B", str(folder), "-G", "Ninja", f"-DPython_EXECUTABLE={sys.executable}"]]
     steps = [] if folder.is_dir() else steps
@@ -117,7 +117,7 @@ def build(copy: Path) -> str:
 
 
 def tried(mutant: Mutant, copy: Path, limit_s: float) -> str:
-    """What the tests say of a copy with the bug, which is taken out again."""
+    """Result of the tests on a copy with the bug; the bug is then removed."""
     place, files = mutant.place(copy), mutant.test_files(copy)
     text = place.read_text()
     is_compiled = place.suffix != ".py"
@@ -132,7 +132,7 @@ def tried(mutant: Mutant, copy: Path, limit_s: float) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Try them, and print the shares; 1 where one survived or could not be tried."""
+    """Try the bugs, and print the shares; return 1 if one survived or could not be tried."""
     args = _parser().parse_args(arguments)
     mutants = [
         mutant
@@ -168,7 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _sound(mutants: Sequence[Mutant], copies: SimpleQueue[Path], limit_s: float) -> str:
-    """Empty where all their tests pass without a bug: a test that fails anyway kills nothing."""
+    """Return "" if all tests of the bugs pass without a bug, because a test that fails anyway kills nothing."""
     copy = copies.get()
     try:
         is_compiled = any(mutant.place(copy).suffix != ".py" for mutant in mutants)

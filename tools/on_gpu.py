@@ -1,7 +1,7 @@
 """What needs an NVIDIA card: ``python -m tools.on_gpu -o FILE.md [--probe FILE.cu]``, the tables of docs/gpu.md.
 
-Tests marked `gpu`, compute-sanitizer, hashes of two runs, iterations a second and each kernel's time; beside them, on
-the same card, a program of CUDA C++ that prints its own figures. A tool that is not there is said so.
+Runs tests marked `gpu` and compute-sanitizer; compares hashes of two runs; measures iterations a second and each
+kernel's time. A CUDA C++ program runs on the same card and prints its own figures. Missing tools are reported.
 """
 
 import argparse
@@ -52,7 +52,7 @@ print(f"imports {imported - begin:.2f} s, device and kernels {time.perf_counter(
 
 
 def wall(count: int, share: float, width: int = WIDTH, height: int = HEIGHT) -> tuple[Float32, TargetView]:
-    """Random splats on a wavy wall that fills the view, radii of `share` of their mean spacing; and the view."""
+    """Random splats on a wavy wall that fills the view, and the view. Radii are `share` of the mean spacing."""
     rng = np.random.default_rng(count)
     u, v = rng.uniform(0, width, count), rng.uniform(0, height, count)
 
@@ -132,7 +132,7 @@ def speeds(device: CudaDevice, share: float, counts: Sequence[int]) -> list[str]
 
 
 def measured(device: CudaDevice, fit: DeviceFit, graph: Graph) -> float:
-    """Median seconds of a replay; each has its place in the schedule."""
+    """Median seconds of a replay, at its place in the schedule."""
     times = []
     for _ in range(ROUNDS):
         fit.rewind([0] * (ITERATIONS + WARM), WEIGHTS, SETTINGS)
@@ -142,7 +142,7 @@ def measured(device: CudaDevice, fit: DeviceFit, graph: Graph) -> float:
 
 
 def shell(*command: str, **variables: str) -> tuple[int, str]:
-    """Exit code and output of a process; 127 where it is not there."""
+    """Exit code and output of a process; 127 if the program is missing."""
     try:
         done = subprocess.run(
             command,
@@ -166,7 +166,7 @@ def inner(part: str) -> list[str]:
 
 
 def sanitized() -> list[str]:
-    """A row for each tool of compute-sanitizer: a few iterations of a small map, and every kernel of the fields."""
+    """Rows by tool of compute-sanitizer, for a few iterations of a small map and every kernel of the fields."""
     rows = ["| compute-sanitizer | of | result | in kernels |", "|---|---|---|---|"]
     programs = {"the fit": inner("small"), "fields": [sys.executable, "-m", "tools.on_gpu_fields", "--small"]}
     for tool in ("memcheck", "racecheck", "initcheck", "synccheck"):

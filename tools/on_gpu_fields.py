@@ -1,4 +1,4 @@
-"""Distance fields on an NVIDIA card, beside the processor of the same machine: ``python -m tools.on_gpu_fields``.
+"""Distance fields on an NVIDIA card, compared with the same machine's processor: ``python -m tools.on_gpu_fields``.
 
 Tables of docs/gpu.md: grids of 256^3 cells, 100,000 points and the spheres of 20,544 states; 5,000 and 50,000 splats.
 """
@@ -75,7 +75,7 @@ def baker(count: int, distance: str, device: CudaDevice | None, cells: int = CEL
 
 
 def commands() -> list[str]:
-    """Rows for whole commands, each a new process: seconds, and whether auto writes what the device it takes does."""
+    """Rows for whole commands, each a new process: seconds, and whether auto writes what its chosen device writes."""
     rows = [
         "Whole commands [s].",
         "",
@@ -106,7 +106,7 @@ def commands() -> list[str]:
 
 
 def command(folder: str, words: Sequence[str], device: str) -> tuple[float, str, str]:
-    """Seconds of a command, what it says, and the digest of its answer."""
+    """Seconds of a command, its output, and the digest of its result."""
     whole = [sys.executable, "-m", "splatctrl_cli", *words, "-o", words[0], "--force", "--device", device]
     begin = time.perf_counter()
     done = subprocess.run(
@@ -130,7 +130,9 @@ def seconds_of(task: Callable[[], object], rounds: int = ROUNDS) -> float:
 
 
 def grids(device: CudaDevice) -> list[str]:
-    """Rows for grids: kernels on the card, with the way back, and the processor's time; hashes of two bakes."""
+    """Rows for grids: times of kernels on the card, without and with copying back, and of the processor; hashes of
+    two bakes.
+    """
     rows = [
         f"{CELLS}^3 cells of {VOXEL:g} m: sdf, bound and gradient.",
         "",
@@ -161,7 +163,7 @@ def grids(device: CudaDevice) -> list[str]:
 
 
 def points(device: CudaDevice) -> list[str]:
-    """Rows for points: distances and gradients, as they are asked and answered."""
+    """Rows for points: times of queries of distances and gradients."""
     rows = [
         "Points along arms, with gradients, of states without: all of a query, from NumPy to NumPy.",
         "",

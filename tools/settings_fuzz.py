@@ -1,7 +1,7 @@
-"""`python -m tools.settings_fuzz`: every key of the configuration with values that none should take, and its command.
+"""`python -m tools.settings_fuzz`: tries each configuration key with invalid values, and a command that uses it.
 
 A value must be refused (exit 2, a line with key, range and value, nothing left behind) or be harmless (exit 0, 1 or 5
-in time). A crash, a hang, another exit code, a value taken out of its range or refused in other words is a fault.
+in time). Faults are: a crash, a hang, another exit code, an accepted value out of range, or a refusal in other words.
 """
 
 import argparse
@@ -55,7 +55,7 @@ class Case:
 
     @property
     def is_in_range(self) -> bool:
-        """Whether the key may hold the value, as far as the key alone says."""
+        """True if the value is valid for the key, without regard to other keys."""
         kind = type(getattr(section_of(self.section), self.key))
         try:
             value = tomllib.loads(f"value = {self.text}")["value"]
@@ -70,7 +70,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a command made of a case: its exit code (None: killed at the time limit), what it said, and the fault."""
+    """Result of a case's command: its exit code (None if killed at the time limit), its output, and the fault."""
 
     case: Case
     code: int | None
@@ -95,7 +95,7 @@ def cases() -> Iterator[Case]:
 
 
 def fault_of(case: Case, code: int | None, said: str, left: Sequence[str]) -> str:
-    """What is wrong with how a command ended that left these files; empty where nothing is."""
+    """The fault in a command's end, given the files that it left; "" without a fault."""
     if code is None:
         return "hang"
     if code < 0:
@@ -146,8 +146,8 @@ class Desk:
 
 
 def run(words: Sequence[object], limit: float) -> tuple[int | None, str, float]:
-    """Exit code (None at the limit [s], negative for a signal), stderr, and seconds of a command in a process of its
-    own, a fork of this one, which has everything imported.
+    """Exit code (None at the limit [s], negative for a signal), stderr, and seconds of a command in a fork of this
+    process, which has everything imported.
     """
     with tempfile.TemporaryFile("w+b") as said:
         start = time.perf_counter()
@@ -180,7 +180,7 @@ def _waited(child: int, end: float) -> int | None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run every case and print a table by section, then each fault; 1 where there is one."""
+    """Run every case and print a table by section, then each fault; return 1 if there is one."""
     parser = argparse.ArgumentParser(prog="python -m tools.settings_fuzz", description=__doc__, allow_abbrev=False)
     parser.add_argument("--only", default="", metavar="TEXT", help="keys that begin so, like control. (default: all)")
     args = parser.parse_args(argv)

@@ -30,9 +30,9 @@ ROBOT = "the robot"
 class Rows:
     """Residuals (M,) and sigma (M,) [m] of two views, or of a frame and the robot.
 
-    jacobian (M, 17): by the two cameras' unknowns and the clock, in `columns` (17,). clusters (M,): equal numbers of
-    the same `alike` have correlated errors. num_laid: points that should lie on the other's surface, even beyond the
-    reach; num_hidden: the occluded of them.
+    jacobian (M, 17): by the unknowns `columns` (17,) of the two cameras and the clock. clusters (M,): residuals of
+    equal number and `alike` have correlated errors. num_laid: points that should lie on the other surface, even
+    beyond the reach. num_hidden: points of num_laid that occlude the robot.
     """
 
     between: tuple[str, str]
@@ -47,14 +47,14 @@ class Rows:
 
 
 Widths = tuple[float, float]
-"""Limits of residuals that count: reach [m], and cut [sigma], inf for the reach alone."""
+"""Limits of residuals that count: reach [m], and cut [sigma]. An infinite cut leaves only the reach."""
 
 
 @dataclass(kw_only=True)
 class Normal:
     """Normal equations H (P, P), g (P,).
 
-    counts: residuals that count, by pair; spread: their robust standard deviation [sigma].
+    counts: residuals with positive weight, by pair. spread: robust standard deviation [sigma] of all residuals.
     """
 
     H: Float64
@@ -67,7 +67,7 @@ class Adjustment:
     """Residuals of evidence, and the estimate that minimises them."""
 
     def __init__(self, evidence: Evidence, unknowns: Unknowns, basis: Float64 | None = None) -> None:
-        """basis (P, K): directions of steps, None for all."""
+        """basis (P, K): allowed directions of steps; None allows all."""
         self.evidence = evidence
         self.unknowns = unknowns
         self._clock = [unknowns.size - 1 if unknowns.has_clock else FIXED]  # its column
@@ -87,7 +87,7 @@ class Adjustment:
         return estimate
 
     def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
-        """The Gauss-Newton step, with a prior of weight `hold`; unobserved directions stay."""
+        """The Gauss-Newton step. A prior, strengthened by `hold`, keeps unobserved directions at `start`."""
         weight, offset = self._prior(estimate, start)
         weight = weight + hold * float(np.trace(normal.H)) / len(weight)
         V = self._basis
@@ -95,7 +95,7 @@ class Adjustment:
         return np.asarray(np.clip(step, -fixed.CALIBRATION_STEP, fixed.CALIBRATION_STEP))
 
     def _prior(self, estimate: Estimate, start: Estimate) -> tuple[Float64, Float64]:
-        """Weight (P,) of a wide prior at the start, and offset from it (P,)."""
+        """Weight (P,) of a wide prior at `start`, and the estimate's offset (P,) from `start`."""
         sigma, offset = np.ones(self.unknowns.size), np.zeros(self.unknowns.size)
         for camera in self.unknowns.cameras:
             columns = self.unknowns.columns(camera)
@@ -136,7 +136,7 @@ class Adjustment:
     def _weighed(
         self, estimate: Estimate, widths: Widths, *, with_robot: bool
     ) -> Iterator[tuple[Rows, Float64, Float64]]:
-        """Yield rows with residuals, their jacobian (M, P) by all unknowns [sigma], and weights (M,)."""
+        """Yield non-empty rows, their jacobian (M, P) [sigma] by all unknowns, and weights (M,)."""
         reach, cut = widths
         for rows in self.rows(estimate, reach, with_robot=with_robot):
             if len(rows.residual):
@@ -148,7 +148,7 @@ class Adjustment:
     def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
         """Misfit, and the number of points that can be compared.
 
-        The misfit averages, over pairs, the mean squared residual [sigma], each cut at `CALIBRATION_CUT`.
+        The misfit averages, over pairs, the mean squared residual [sigma^2]. Residuals are cut at `CALIBRATION_CUT`.
         """
         sums: dict[tuple[str, str], float] = {}
         laid: dict[tuple[str, str], int] = {}
@@ -162,7 +162,7 @@ class Adjustment:
         return (float(np.mean(means)) if means else most), sum(laid.values())
 
     def distance(self, estimate: Estimate) -> float | None:
-        """Largest median distance [m] of a pair, cut at the first reach; None without points.
+        """Largest median distance [m] of a pair, cut at the first reach; None with few points.
 
         Points that occlude the robot do not count.
         """
@@ -184,7 +184,7 @@ class Adjustment:
             yield from filter(None, [self._robot(frame, estimate, reach)])
 
     def _find_pose(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
-        """T_world_camera, and its motion with the clock, camera frame."""
+        """T_world_camera (4, 4), and its motion (6,) with the clock, camera frame."""
         T, twist = self.evidence.recorded(item, estimate.clock)
         correction = estimate.corrections[item.camera]
         return T @ correction, _carry(twist, correction)
@@ -272,7 +272,7 @@ class Adjustment:
 
 
 def _cells(points_world: Float64, depth: float) -> Index:
-    """World cube of each point (K, 3); its errors are alike. depth [m]: the median."""
+    """Number (K,) of each point's world cube; errors in one cube correlate. depth [m]: the median."""
     x, y, z = np.floor(points_world / (fixed.CALIBRATION_CELL * depth)).astype(np.int64).T
     return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
 

@@ -48,7 +48,7 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """A board in a frame: T_camera_board (4, 4), and measured over expected depth (or None)."""
+    """A board in a frame: T_camera_board (4, 4), and the ratio of measured to expected depth."""
 
     camera: str
     stamp_ns: int
@@ -79,7 +79,7 @@ def sighting_of(board: Board, frame: RgbdFrame) -> Sighting | None:
 
 
 def other_size(frame: RgbdFrame) -> tuple[int, int] | None:
-    """Inner corners, larger number first, of any other chessboard in view, or None."""
+    """Numbers of inner corners, larger first, of any chessboard in view; None without one."""
     is_found, _, meta = cv2.findChessboardCornersSBWithMeta(
         cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), (3, 3), cv2.CALIB_CB_LARGER
     )
@@ -139,7 +139,7 @@ def _marked_corners(board: Board, gray: UInt8) -> Float64 | None:
 
 
 def _sighting(board: Board, frame: RgbdFrame, pixels: Float64) -> Sighting | None:
-    """The board's pose: a plane's corners allow two, and depth decides."""
+    """The board's pose. A plane's corners allow two poses; depth selects one."""
     _, turns, moves, errors = cv2.solvePnPGeneric(
         board.points, pixels, matrix_of(frame.intrinsics), None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -174,7 +174,7 @@ SHOW = "show the board to neighbouring cameras at the same moment, or keep some 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Recorded T_world_camera (4, 4) by camera and stamp [ns], moving cameras, robot, cameras that stay."""
+    """Recorded T_world_camera (4, 4) by camera and stamp [ns], moving cameras, robot, and fixed cameras."""
 
     recorded: Mapping[str, Mapping[int, Float64]]
     moving: frozenset[str]
@@ -183,15 +183,15 @@ class Rig:
 
 
 HandEye = tuple[Float64, Float64, float]
-"""X (4, 4) that keeps ``A X B`` constant, that constant, and the median deviation [m] from it."""
+"""X (4, 4), the ``A X B`` (4, 4) that it keeps constant, and the median deviation [m]."""
 
 
 def board_start(board: Board, sightings: Sequence[Sighting], rig: Rig) -> dict[str, Float64]:
     """T_recorded_camera (4, 4) by camera, from sightings of a board.
 
-    Without a robot or a moving camera, the board ties all others to the `anchors`. Otherwise hand-eye
-    calibration first places a moving camera by a stationary board, or a stationary one by a board on a link. Raises
-    NotEvaluableError for too few sightings, other squares, or cameras that this does not reach.
+    Hand-eye calibration first places moving cameras by a stationary board, or stationary cameras by a board on a
+    link. The board then ties the other cameras to these, or to the `anchors`. Raises NotEvaluableError for too few
+    sightings, squares of another size, or cameras that the board does not tie.
     """
     by_camera = {camera: [s for s in sightings if s.camera == camera] for camera in rig.recorded}
     _check_seen(board, by_camera)
@@ -296,11 +296,11 @@ def _check_fit(off: float, what: str) -> None:
 
 
 def hand_eye(pairs: Sequence[tuple[Float64, Float64]]) -> HandEye:
-    """X (4, 4) with the same ``A X B`` for all pairs (A, B), that product, and their median deviation [m].
+    """X (4, 4) with one ``A X B`` for all pairs (A, B), that product, and the median deviation [m].
 
-    From ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the right's rotation vectors into the left's, and its
-    translation is linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once. Raises
-    NotEvaluableError for too few pairs, or rotation about fewer than two axes.
+    Solves ``(A_j^-1 A_i) X = X (B_j B_i^-1)``: X turns the B factors' rotation vectors into the A factors'; its
+    translation is then linear (after Park and Martin, Robot sensor calibration, 1994). Outliers are dropped once.
+    Raises NotEvaluableError for too few pairs, or rotation about fewer than two axes.
     """
     pairs = spread(pairs, fixed.CALIBRATION_FRAMES)
     refuse_if(
@@ -356,9 +356,9 @@ def _votes(
     rig: Rig,
     stands: bool,
 ) -> list[Float64]:
-    """T_world_camera (4, 4) of a stationary camera, per sighting shared with a placed one.
+    """T_world_camera (4, 4) of a stationary camera, per sighting shared with a placed camera.
 
-    placed: T_recorded_camera by camera; T_world_board: of a stationary board, or None.
+    placed: T_recorded_camera (4, 4) by camera. T_world_board: of a stationary board, or None.
     """
     votes = []
     if camera in rig.moving:

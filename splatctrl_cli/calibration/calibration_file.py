@@ -25,8 +25,8 @@ class CalibratedCamera:
 
     T (4, 4): T_world_camera if stationary, T_recorded_camera if moving. recorded (4, 4): the recording's
     T_world_camera, None if moving. scale, bias [m]: the true depth is ``scale depth + bias``. sigma_position (3,)
-    [m], sigma_rotation (3,) [rad]: in the world's axes, or a moving camera's own. sigma_depth: of scale and bias.
-    depth_noticed: the least noticeable |scale - 1| and |bias| [m], or inf. as_recorded: parts not solved for.
+    [m], sigma_rotation (3,) [rad]: along the world's axes, or a moving camera's own. sigma_depth: of scale and bias
+    [m]. depth_noticed: the least noticeable |scale - 1| and |bias| [m], or inf. as_recorded: parts not solved for.
     unobserved: directions kept as recorded.
     """
 
@@ -51,7 +51,7 @@ class CalibratedCamera:
 class Calibration:
     """The calibration of a recording.
 
-    clock [s]: a frame's stamp minus the joint state's at that instant, None if not solved for; digests: sha256 by
+    clock [s]: a frame's stamp minus the joint state's at that instant; None if not solved for. digests: sha256 by
     file.
     """
 

@@ -17,7 +17,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class Certainty:
-    """Covariance (P, P) of the unknowns; reach (P, P): to displacements [m] in view."""
+    """Covariance (P, P) of the unknowns; `reach` (P, P) maps them to displacements [m] in view."""
 
     unknowns: Unknowns
     covariance: Float64
@@ -29,7 +29,7 @@ class Certainty:
         return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
 
     def displacement(self, camera: str) -> Float64:
-        """Covariance (6, 6) [m^2] of displacements: of the rim by rotation, of the middle."""
+        """Covariance (6, 6) [m^2] of displacements in view: of the rim by rotation, then of the middle."""
         columns = self.unknowns.columns(camera)[:POSE]
         if columns[0] < 0:
             return np.zeros((POSE, POSE))
@@ -58,10 +58,10 @@ class Certainty:
 def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> Certainty:
     """The certainty of a solved estimate.
 
-    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums products of clusters' gradients, to count correlated errors;
-    A is the gradient's derivative. Noise tilts normals of flat surfaces: between views, A uses differences with
-    points projected anew, where that cancels. Raises NotEvaluableError where no view measures a surface that another
-    view or the robot has.
+    The covariance is ``A^-1 M A^-T`` (the sandwich of White, 1980). M sums products of clusters' gradients, to count
+    correlated errors. A is the gradient's derivative. Between views it is a difference with points projected anew,
+    which cancels noise that tilts normals. Raises NotEvaluableError if no view shares a surface with another view or
+    the robot.
     """
     whole, scores = adjustment.normal(estimate, widths), adjustment.scores(estimate, widths)
     refuse_if(
@@ -98,7 +98,7 @@ def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> 
 
 
 def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
-    """(P, P): the unknowns as displacements [m] of what the cameras see."""
+    """Matrix (P, P) from unknowns to displacements [m] in view."""
     unknowns = adjustment.unknowns
     reach = np.eye(unknowns.size)
     for camera in unknowns.cameras:
@@ -132,7 +132,7 @@ Plane = tuple[str, Float64]  # name, and unit normal (3,), world
 
 
 def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
-    """The largest plane in a view; None below a quarter of the normals."""
+    """The largest plane in a view; None if under a quarter of normals fit."""
     normals = view.normals.reshape(-1, 3)
     normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
     if len(normals) < 100:
@@ -162,7 +162,7 @@ def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane
 
 
 def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> float:
-    """Share of a direction (6,), world, in the unknown ones (6, K), camera frame."""
+    """Share of a direction (6,), world, that lies in `unknown` directions (6, K), camera frame."""
     R = T_world_camera[:3, :3].T
     return float(np.sum(np.square(unknown.T @ np.concatenate([R @ direction[:3], R @ direction[3:]]))))
 

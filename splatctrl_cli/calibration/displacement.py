@@ -1,7 +1,4 @@
-"""Errors of cameras' poses against the visible robot, and corrections.
-
-If all cameras agree, the robot itself may be off.
-"""
+"""Errors of cameras' poses against the visible robot, and corrections."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,11 +24,11 @@ from splatctrl_cli.records import Float64, RgbdFrame, spread
 
 
 def displaced_cameras(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, dict[str, Any]]:
-    """Rows of `displacement_of` by camera, without those that show too little of the robot.
+    """Rows of `displacement_of` by camera, without cameras that show too little robot.
 
-    A stationary camera is corrected if the arm moves and the correction puts each link in place. Its row then has
-    `T_recorded_camera`, 16 numbers by row, and `left_mm`, the last step. If one cannot be corrected, none is: the
-    robot may be off.
+    A displaced stationary camera is corrected if the arm moves and the correction puts each link in place. Its row
+    then has `T_recorded_camera` (16 numbers by row), and `left_mm`, the last step. If one displaced camera cannot be
+    corrected, none is: the robot may be misplaced.
     """
     by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
     displacements = {camera: _correct_camera(arm, its) for camera, its in by_camera.items()}
@@ -85,7 +82,7 @@ def _correct_camera(arm: Arm, frames: Sequence[RgbdFrame]) -> dict[str, Any] | N
 
 
 def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
-    """True if two links or more are clearly visible, each within half of `MISPLACED`."""
+    """True if at least two links are clearly visible, each within half of `MISPLACED`."""
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     rows_by_frame = [rows for frame in shown if (rows := _rows(arm, frame, np.eye(4))) is not None]
     links, residual = (
@@ -99,12 +96,12 @@ def _sees_links_in_place(arm: Arm, frames: Sequence[RgbdFrame]) -> bool:
 def displacement_of(arm: Arm, frames: Sequence[RgbdFrame]) -> tuple[dict[str, Any], Float64] | None:
     """One camera's pose error and correction T_recorded_camera (4, 4); None if little robot shows.
 
-    `distance_mm`, with its `sigma_mm`: root mean square motion of the robot's `num_pixels` visible points by the
-    correction.
+    `distance_mm`: root mean square motion of the robot's `num_pixels` visible points by the correction. `sigma_mm`:
+    of their middle.
 
-    Two Gauss-Newton steps on point-to-plane distances, with Huber's weight from two sigma. Neighbouring pixels err
-    alike: `DISPLACED_ALIKE` count as one. The distance is `DISPLACED_WIDTH` if fewer than `DISPLACED_SHARE` of the
-    expected pixels show the robot within it.
+    Takes two Gauss-Newton steps on point-to-plane distances, with Huber's weight beyond two sigma. `DISPLACED_ALIKE`
+    neighbouring pixels count as one: their errors correlate. `distance_mm` is `DISPLACED_WIDTH` if less than
+    `DISPLACED_SHARE` of the expected pixels lie within that distance of the robot.
     """
     shown = [strided(frame, DISPLACED_ROWS) for frame in spread(frames, DISPLACED_FRAMES)]
     T, prior = np.eye(4), np.eye(POSE) / DISPLACED_PRIOR**2

@@ -1,4 +1,4 @@
-"""Evidence of a calibration: overlapping views and the arm's links; and its unknowns."""
+"""Evidence of a calibration (overlapping views, the arm's links), and its unknowns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,8 +31,8 @@ FIXED = -1
 class Estimate:
     """Poses, depth corrections and clock offset.
 
-    ``T_world_camera = T_world_recorded @ T_recorded_camera``, with corrections (4, 4). depth: scale and bias [m];
-    clock [s], as in `Calibration`.
+    corrections: T_recorded_camera (4, 4). depth: scale and bias [m]. clock [s]: a frame's stamp minus the joint
+    state's at that instant.
     """
 
     corrections: Mapping[str, Float64]
@@ -106,9 +106,9 @@ STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: l
 class ArmRows:
     """Distances of M points from the robot's surface: residual (M,) [m], positive outside.
 
-    jacobian (M, 6): by the camera's rotation and translation in its frame; clock (M,) [m/s]: by the clock. points,
-    normals (M, 3): camera frame. num_seen: pixels that should show the robot; num_hidden: those occluded by more than
-    `width`.
+    jacobian (M, 6): by the camera's rotation and translation, own frame. clock (M,) [m/s]: by the clock. points,
+    normals (M, 3): camera frame. num_seen: pixels that should show the robot. num_hidden: pixels of num_seen with
+    depth over `width` nearer.
     """
 
     residual: Float64
@@ -133,7 +133,7 @@ class Arm:
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 
     def link_pose(self, link: str, stamp_ns: int) -> Float64 | None:
-        """T_world_link (4, 4) at a time [ns]; None if no joint state is near."""
+        """T_world_link (4, 4) at a time [ns]; None without joint positions."""
         q = self.posture(stamp_ns)
         return None if q is None else self.model.frame_pose(q, link)
 
@@ -154,8 +154,8 @@ class Arm:
     ) -> ArmRows | None:
         """Rows of pixels within `width` [m] of the robot's rendered surface; None without joint states.
 
-        stamp_ns: of the joint states; camera_twist (6,) [1/s]: the camera's motion with the clock, own frame. Link
-        borders, and links modelled by spheres or boxes, do not count.
+        stamp_ns: of the joint states. camera_twist (6,) [1/s]: the camera's motion per second of clock, own frame.
+        Link borders, and links modelled by spheres or boxes, do not count.
         """
         poses, before, after = (self.surface_poses(stamp_ns + step) for step in (0, -STEP_NS, STEP_NS))
         if poses is None:
@@ -192,7 +192,10 @@ class Arm:
         )
 
     def mount_of(self, poses: list[tuple[int, Float64]]) -> tuple[str, Float64] | None:
-        """The link that carries a camera with stamps [ns] and T_world_camera, and T_link_camera; or None."""
+        """The link that carries a camera, and T_link_camera (4, 4); or None.
+
+        poses: stamps [ns] and T_world_camera (4, 4).
+        """
         for link in reversed(self.model.frame_names):
             mounted = [(self.link_pose(link, stamp), T) for stamp, T in poses]
             offsets = np.array([invert_transform(at) @ T for at, T in mounted if at is not None])
@@ -214,7 +217,7 @@ class Arm:
 
 
 def _velocities(before: Float64, after: Float64, poses: Float64, T_world_camera: Float64) -> Float64:
-    """(L, 4, 4) velocities [1/s] of points fixed to each link, camera frame."""
+    """Velocity matrices (L, 4, 4) [1/s] of points fixed to each link, camera frame."""
     T_camera_world = invert_transform(T_world_camera)
     moved = [T_camera_world @ at @ np.linalg.inv(poses) @ T_world_camera for at in (before, after)]
     return np.asarray((moved[1] - moved[0]) / (2e-9 * STEP_NS))
@@ -242,7 +245,8 @@ class Evidence:
     """Views, frames and robot of a calibration.
 
     views: one per stationary camera (`still_frame`), several per moving one. pairs (i, j): points of view i are
-    compared with view j. frames: searched for the robot. mounts: link of a moving camera, and recorded T_link_camera.
+    compared with view j. frames: searched for the robot. mounts: link of a camera on the robot, and recorded
+    T_link_camera.
     """
 
     views: Sequence[DepthView]
@@ -262,9 +266,9 @@ class Evidence:
         return float(np.median(np.concatenate([view.points[:, 2] for view in self.views] + [np.ones(1)])))
 
     def recorded(self, item: DepthView | RgbdFrame, clock: float) -> tuple[Float64, Float64]:
-        """Uncorrected T_world_camera (4, 4), and its motion with the clock (6,) [1/s].
+        """Uncorrected T_world_camera (4, 4), and its motion (6,) [1/s] per second of clock.
 
-        On the robot, the joint states place the camera, at its stamp by their clock.
+        Joint states place a camera on the robot, at the camera's stamp minus `clock` [s].
         """
         if self.arm is None or item.camera not in self.mounts:
             return item.T_world_camera, np.zeros(POSE)

@@ -18,8 +18,8 @@ EVERY = slice(None)
 class GrayView:
     """A view with lengths divided by the recording's scale, and its grey values.
 
-    gray (h, w) in [0, 1]; slope (h, w, 2) per pixel; points_gray (K,): at the view's points. tiles (K,): each point's
-    tile, in a checkerboard: even ones solve poses, odd ones judge.
+    gray (h, w) in [0, 1]. slope (h, w, 2): per pixel along u and v. points_gray (K,): at the view's points. tiles
+    (K,): each point's tile in a checkerboard. Even tiles solve poses, odd tiles judge.
     """
 
     depth: DepthView
@@ -70,7 +70,7 @@ def scaled(T: Float64, factor: float) -> Float64:
 def overlapping(
     views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
 ) -> list[tuple[int, int]]:
-    """Pairs (i, j) of views `among` (N,): those that see most of i's points."""
+    """Pairs (i, j) of views `among` (N,): the views j that see most of i's points."""
     chosen = np.flatnonzero(among).tolist()
     middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
                         if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip
@@ -98,9 +98,9 @@ def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Weighted residuals (R,) [sigma], and derivatives by views a's and b's motions (R, 12).
+    """Weighted residuals (R,) [sigma], and derivatives (R, 12) by the motions of views a and b.
 
-    by_own, by_other (R,): by log-depth of view a's point `own` and view b's pixel `other`.
+    by_own, by_other (R,): derivatives by log-depth of view a's point `own` and of view b's pixel `other`.
     """
 
     residuals: Float64
@@ -112,7 +112,7 @@ class Rows:
 
 
 def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
-    """Rows of view a's solved points on view b, T (4, 4) apart."""
+    """Rows of view a's `is_solved` points on view b; T (4, 4) maps a to b."""
     number = np.flatnonzero(a.is_solved)
     points, lands, surface, normals, distance = hit_surface(a, b, T, a.is_solved)
     sigma = np.hypot(depth_sigma(points[:, 2]), depth_sigma(a.depth.points[number, 2]))
@@ -152,9 +152,9 @@ def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
 def hit_surface(
     a: GrayView, b: GrayView, T: Float64, which: slice | Bool = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
-    """View a's points in view b, at T (4, 4): points, hits, surface, normals, distances.
+    """View a's points in view b's frame, hits, surface, normals and distances.
 
-    Arrays are (K, 3) or (K,). A hit's surface faces like the point's own.
+    T (4, 4) maps a to b. Arrays are (K, 3) or (K,). At hits, both surfaces face alike.
     """
     points = transform_points(T, a.depth.points[which])
     lands, surface, normals = landed(points, b.depth)
@@ -165,7 +165,7 @@ def hit_surface(
 def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
     """Squared differences (2, K) [sigma^2] of depth and grey value, and tiles (K,), of view a's judging points.
 
-    T (4, 4) apart. Differences are cut, and nan without a common surface.
+    T (4, 4) maps a to b. Differences are cut, and NaN without a common surface.
     """
     number = np.flatnonzero(~a.is_solved)
     points, lands, _, _, distance = hit_surface(a, b, T, ~a.is_solved)
@@ -183,7 +183,8 @@ def misfits_of(a: GrayView, b: GrayView, T: Float64) -> tuple[Float64, Index]:
 def _gray_differences(a: GrayView, b: GrayView, number: Index, pixels: Float64) -> tuple[Float64, Float64]:
     """Grey differences (K,) of view a's points `number` from view b, and b's slopes (K, 2).
 
-    Both are at pixels (K, 2) of b."""
+    Both are taken at `pixels` (K, 2) of b.
+    """
     u, v = np.round(pixels).astype(np.int64).T
     slope = b.slope[v, u].astype(np.float64)
     value = b.gray[v, u] + np.einsum("ki,ki->k", slope, pixels - np.stack([u, v], axis=1))
@@ -204,9 +205,9 @@ def _alike(value: Float64, other: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class BandRatios:
-    """E median brightness ratios of shared surfaces, between B bands of rows of N images.
+    """Median brightness ratios of shared surfaces, between bands of rows of N images.
 
-    pairs (E, 2): bands, numbered B times the image plus their own; ratios (E,): log of first over second.
+    pairs (E, 2): bands, numbered ``B image + band``. ratios (E,): log of the first over the second.
     """
 
     num_images: int
@@ -219,7 +220,7 @@ class BandRatios:
     def gains(self, is_free: Bool) -> Float64:
         """Gains (N, B, 3) of red, green and blue, by least squares of logarithms.
 
-        A wide prior keeps them about 1; images not `is_free` (N,) keep 1.
+        A wide prior keeps gains about 1; images not `is_free` (N,) have gain 1.
         """
         num_gains, is_kept = self.num_bands * self.num_images, np.repeat(~is_free, self.num_bands)
         A = np.tile(np.eye(num_gains) / fixed.EXPOSURE_PRIOR**2, (3, 1, 1))
@@ -244,14 +245,14 @@ class BandRatios:
 def exposure_gains(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None) -> Float64:
     """Gains (N, 3) of red, green and blue; images divided by them match.
 
-    scale: of the recording's lengths; views not `free` (N,) keep gain 1.
+    scale: divides the recording's lengths. Views not `free` (N,) have gain 1.
     """
     is_free = np.ones(len(frames), np.bool_) if free is None else free
     return band_ratios(frames, scale, is_free, 1).gains(is_free)[:, 0]
 
 
 def band_ratios(frames: Sequence[RgbdFrame], scale: float, is_free: Bool, num_bands: int) -> BandRatios:
-    """Ratios of overlapping pairs with a free view, without near black and white."""
+    """Ratios of overlapping pairs with a free view, without nearly black and white pixels."""
     views = [gray_view(frame, scale) for frame in frames]
     poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     colors = [_small(frame, view.gray.shape[0]) for frame, view in zip(frames, views, strict=True)]

@@ -4,9 +4,9 @@ Gauss-Newton in float64, with Tukey's biweight, on point-to-plane distances and 
 Medioni, Object modelling by registration, 1992; Park, Zhou and Koltun, Colored point cloud registration revisited,
 2017.
 
-A triangulating camera errs in disparity by a smooth offset, constant per camera: surfaces bend. Its part in (1, u,
-v), which poses absorb, stays. After Zhou and Koltun, Simultaneous localization and calibration (2014), whose lattice
-lies in space.
+A triangulating camera's disparity has a smooth, constant error, which bends surfaces. The error's part that is linear
+in pixels (u, v) is not corrected, because poses absorb it. After Zhou and Koltun, Simultaneous localization and
+calibration (2014); their lattice lies in space.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,9 +34,9 @@ from splatctrl_cli.records import Bool, Float64, Index, RgbdFrame
 
 
 def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
-    """Factor on depths (...) [m] for disparity offsets (...) [1/m], and its log-derivative [m].
+    """Factor on depths (...) [m] for disparity offsets (...) [1/m], and its logarithm's derivative [m].
 
-    ``1 / z' = 1 / z - offset``, the offset cut at `BEND_MOST` of the disparity.
+    Corrected depth z' has ``1 / z' = 1 / z - offset``. The offset is cut at `BEND_MOST` of the disparity.
     """
     share = offset * depth
     factor = 1 / (1 - np.clip(share, -fixed.BEND_MOST, fixed.BEND_MOST))
@@ -44,7 +44,7 @@ def stretch(depth: Float64, offset: Float64) -> tuple[Float64, Float64]:
 
 
 def unbent(frame: RgbdFrame, grid: Float64) -> RgbdFrame:
-    """The frame with disparity offsets (rows, columns) [1/m], bilinear, removed from depth."""
+    """The frame with disparity offsets (rows, columns) [1/m], interpolated bilinearly, removed from depth."""
     factor, _ = stretch(
         frame.depth.astype(np.float64), (_weights(frame.depth.shape) @ grid.ravel()).reshape(frame.depth.shape)
     )
@@ -84,7 +84,7 @@ def _roughness() -> Float64:
 
 
 def bends_alone() -> Float64:
-    """(G, G - 3) orthonormal basis of grids without a part in (1, u, v)."""
+    """Orthonormal basis (G, G - 3) of grids orthogonal to 1, u and v."""
     v, u = np.indices(fixed.BEND_GRID).reshape(2, -1)
     return np.asarray(null_space(np.stack([np.ones(len(u)), u, v])))
 
@@ -111,16 +111,19 @@ class BentViews:
 
     @property
     def grids(self) -> Float64:
-        """Offsets of disparity (C, rows, columns), in the views' scaled lengths."""
+        """Disparity offsets (C, rows, columns), per unit of the views' scaled lengths."""
         return (self._free @ self._basis.T).reshape(self._num, *fixed.BEND_GRID)
 
     def begin(self, size: int) -> None:
-        """Begin a round with `size` pose unknowns: its equations are zero."""
+        """Begin a round with `size` pose unknowns, and equations of zeros."""
         num = self._num * len(self._basis)
         self._cross, self._own, self._slope = np.zeros((size, num)), np.zeros((num, num)), np.zeros(num)
 
     def add(self, i: int, j: int, rows: Rows, columns: Index, J: Float64) -> None:
-        """Add view i on view j to the round's equations; derivatives J (R, F) in `columns`."""
+        """Add view i's residuals on view j to the round's equations.
+
+        J (R, F): derivatives by pose unknowns `columns`.
+        """
         by_offsets = self.derive_by_offsets(i, j, rows)
         self._cross[columns] += (by_offsets.T @ J).T
         square = (by_offsets.T @ by_offsets).tocoo()
@@ -128,7 +131,7 @@ class BentViews:
         self._slope[:] += by_offsets.T @ rows.residuals
 
     def derive_by_offsets(self, i: int, j: int, rows: Rows) -> csr_array:
-        """(R, C G) derivatives of view i's residuals on view j by offsets."""
+        """Derivatives (R, C G) of view i's residuals on view j by disparity offsets."""
         size, parts = len(self._basis), []
         for k, pixels, by_stretch in ((i, self._pixels[i][rows.own], rows.by_own), (j, rows.other, rows.by_other)):
             if self.cameras[k] == FIXED:
@@ -181,8 +184,8 @@ def _pixels(view: GrayView) -> Index:
 class RefinedPoses:
     """Refined T_world_camera (4, 4); how far each moved [m] and turned [deg], (N,).
 
-    before, after: median distance [m] between views' surfaces, at points not used. is_held (N,): kept as recorded,
-    because untied or moved too far. is_better: False if all stayed, since a change gains nothing.
+    before, after: median distance [m] between views' surfaces, at points that solved no pose. is_held (N,): kept as
+    recorded, because no view overlaps or the pose moved too far. is_better: False if no pose changed.
     """
 
     T_world_camera: tuple[Float64, ...]
@@ -197,10 +200,10 @@ class RefinedPoses:
 def refined_poses(
     frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | None = None, *, must_gain: bool = True
 ) -> RefinedPoses:
-    """Refine the poses of `free` (N,) frames; scale: of the recording's lengths.
+    """Refine the poses of `free` (N,) frames.
 
-    A wide prior anchors the whole. Frames that would move beyond `REFINE_FARTHEST` stay, and with must_gain those
-    whose judging points gain nothing.
+    scale: divides the recording's lengths. A wide prior anchors all poses. Frames that would move beyond
+    `REFINE_FARTHEST` stay as recorded. With must_gain, so do frames whose judging points gain nothing.
     """
     views = [gray_view(frame, scale) for frame in frames]
     recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
@@ -238,7 +241,7 @@ def refined_poses(
 class FoundBends:
     """Disparity offsets (rows, columns) [1/m] by camera, where observable.
 
-    gains: shares by which each half's bend reduces the other half's distances. unlike: cameras whose halves disagree.
+    gains: shares by which each half's bends reduce the other half's distances. unlike: cameras whose halves disagree.
     """
 
     grids: Mapping[str, Float64] = field(default_factory=dict)
@@ -247,10 +250,11 @@ class FoundBends:
 
 
 def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float = 1.0) -> FoundBends:
-    """The bends of the cameras' depths, solved with the `refined` poses.
+    """The bends of the cameras' depths, solved jointly with poses from `refined`.
 
-    Each half (every second view) of a camera's views must yield a bend that reduces the other half's distances by
-    `BEND_GAIN` over poses alone. Cameras need `BEND_VIEWS` views, and halves that agree by `BEND_ALIKE`.
+    Each half (every second view) of a camera's views must give bends that reduce the other half's distances by
+    `BEND_GAIN`, compared with poses only. Cameras need `BEND_VIEWS` views, and a cosine of `BEND_ALIKE` between the
+    halves' bends.
     """
     views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]
     views = [view for view, is_held in zip(views, refined.is_held, strict=True) if not is_held]
@@ -346,7 +350,7 @@ def _gains(
 ) -> Bool:
     """Views (N,) whose judging points agree better with other views at poses `after`.
 
-    Wrong poses may reduce distances: grey values must agree better beyond their noise, or no worse if distances fall
+    Wrong poses may reduce distances. Grey values must agree better beyond their noise, or no worse if distances fall
     by `REFINE_GAIN`.
     """
     parts: list[list[Float64]] = [[np.zeros((5, 0))] for _ in views]
@@ -371,7 +375,7 @@ def _agrees_better(
 
 
 def _gain(before: Float64, after: Float64, tiles: Float64) -> tuple[float, float]:
-    """Share of the misfit (K,) gained, and its ratio (K,) to its standard error over tiles.
+    """Share by which misfits (K,) fall, and the fall's ratio to its standard error over tiles.
 
     Both are 0 without common points.
     """

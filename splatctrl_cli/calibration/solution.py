@@ -1,4 +1,4 @@
-"""Solves a calibration from several starts, and rejects it if two solutions fit alike."""
+"""Solves a calibration from several starts, and rejects it if two solutions fit equally well."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ FREED = tuple((reach, np.inf) for reach in fixed.CALIBRATION_FREED)
 class Solution:
     """The estimate, its certainty, and its residuals within `widths`.
 
-    noticed: `depth_noticed` by camera.
+    noticed: `CalibratedCamera.depth_noticed` by camera.
     """
 
     estimate: Estimate
@@ -53,7 +53,7 @@ class Solution:
 def solved(evidence: Evidence, start: Estimate, anchors: Sequence[str]) -> Solution:
     """Calibrate all cameras but `anchors`.
 
-    Raises NotEvaluableError if cameras share no surface, or two solutions fit alike.
+    Raises NotEvaluableError if cameras share no surface, or two solutions fit equally well.
     """
     cameras = evidence.cameras
     adjustment = Adjustment(
@@ -117,7 +117,7 @@ def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
 
 
 def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
-    """Final widths: Tukey's, by the residuals' actual spread."""
+    """Final widths, with Tukey's cut by the residuals' spread."""
     spread = adjustment.normal(estimate, WIDE[-1]).spread
     return WIDE[-1][0], fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD)
 
@@ -169,7 +169,7 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
 def _add_depths(solution: Solution) -> Solution:
     """Solve again with clearly supported depth scales and biases.
 
-    All are tried together; the least certain are fixed one by one, until all left differ by
+    All are solved together. The least certain is then fixed as recorded, until every free one differs by
     `CALIBRATION_DEPTH_SURE[0]` sigmas.
     """
     unknowns = solution.adjustment.unknowns
@@ -189,7 +189,7 @@ def _add_depths(solution: Solution) -> Solution:
 
 
 def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
-    """Depth unknowns' offsets (P,) from 1 or 0, covariance (P, P), and free columns."""
+    """Offsets (P,) of depth unknowns from 1 or 0, covariance (P, P), and free columns."""
     unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
     off, free, usual = np.zeros(unknowns.size), [], []
     for camera in unknowns.cameras:
@@ -211,7 +211,7 @@ def _narrow_depths(tried: Solution) -> tuple[Float64, Float64, list[int]]:
 
 
 def _hold(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
-    """Estimates (P,) and covariance (P, P), with one fixed at 0."""
+    """Offsets (P,) and covariance (P, P), with unknown `at` fixed at 0."""
     gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
     return off - gain * off[at], _positive(covariance - np.outer(gain, covariance[at]))
 

@@ -17,7 +17,7 @@ SMOOTH = 0.1  # of the depth, that a pixel and its four neighbours may differ by
 class DepthView:
     """One depth image, in its camera's optical frame [m].
 
-    surface, normals (h, w, 3): per pixel, normals towards the camera, 0 if unknown. points, point_normals (K, 3): a
+    surface, normals (h, w, 3): per pixel; normals point to the camera, 0 if unknown. points, point_normals (K, 3): a
     subset with normals. T_world_camera (4, 4): as recorded.
     """
 
@@ -51,7 +51,7 @@ class DepthView:
 
 
 def _balance_directions(normals: Float64, most: int) -> Index:
-    """Numbers, in order, of at most `most` normals (N, 3), balanced over directions.
+    """Sorted indices of at most `most` normals (N, 3), balanced over directions.
 
     Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
     """
@@ -85,7 +85,7 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
     """Unit normals (h, w, 3) towards the camera of a surface (h, w, 3).
 
-    From points `step` pixels to either side; 0 along edges and without depth.
+    Computed from points `step` pixels to either side; 0 along depth edges and without depth.
     """
     normals = np.zeros_like(surface)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
@@ -101,7 +101,7 @@ def surface_normals(surface: Float64, step: int = 1) -> Float64:
 
 
 def bend(depth: Float32, step: int = 1) -> Float64:
-    """Largest deviation (h, w) [m] of depth from the mean at `step` pixels."""
+    """Largest deviation (h, w) [m] of depth from the mean of pixels `step` to either side."""
     bent = np.zeros(depth.shape)
     middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     z = depth.astype(np.float64)
@@ -113,7 +113,7 @@ def bend(depth: Float32, step: int = 1) -> Float64:
 
 
 def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
-    """Return which points (K, 3), camera frame, land on depth, its surface and normals."""
+    """Return which points (K, 3), camera frame, land on depth, and the surface and normals there."""
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
     lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)
@@ -125,25 +125,25 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
 def derive_by_twists(own: Float64, projected: Float64, gradient: Float64, T: Float64) -> Float64:
     """Derivatives (K, 12) of a value at `projected` (K, 3) by two cameras' motions.
 
-    The first camera has the point at `own` (K, 3), at T (4, 4); the second sees it. gradient (K, 3): by the point.
-    Motions are in own frames. T exp(x) moves points by ``x[:3] x p + x[3:]``, so ``g . T exp(x) p`` changes by ``(p x
-    R^T g) . x[:3] + R^T g . x[3:]``; the second camera's sign is opposite.
+    own (K, 3): points in the first camera's frame, which T (4, 4) maps to the second's. gradient (K, 3): by
+    `projected`. Motions are in each camera's frame. ``exp(x)`` moves a point p by ``x[:3] x p + x[3:]``, so ``g . T
+    exp(x) p`` changes by ``(p x R^T g) . x[:3] + R^T g . x[3:]``. The second camera's sign is opposite.
     """
     along = gradient @ T[:3, :3]
     return np.hstack([_cross(own, along), along, _cross(gradient, projected), -gradient])
 
 
 def _cross(a: Float64, b: Float64) -> Float64:
-    """`np.cross` of (K, 3), without what that costs for a few points."""
+    """Cross products (K, 3), faster than `np.cross` for few points."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def overlap_rows(
     points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
 ) -> tuple[Float64, Float64]:
-    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12), `derive_by_twists`.
+    """Distances (M,) [m] of points from a view's surface planes, and derivatives (M, 12) by `derive_by_twists`.
 
-    points (K, 3): of the other view, at T (4, 4); which (K,): those that land (`landed`).
+    points (K, 3): in the other view's frame, which T (4, 4) maps to this one. which (K,): points that land.
     """
     projected, normal = transform_points(T, points[which]), normals[which]
     return np.einsum("ki,ki->k", projected - surface[which], normal), derive_by_twists(
@@ -152,7 +152,7 @@ def overlap_rows(
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
-    """A stationary camera's frame: the mean of inverse depths near their median.
+    """A stationary camera's frame, with mean inverse depths near their median.
 
     Half of the frames must agree within three `depth_sigma`, else depth is 0.
     """
@@ -174,12 +174,12 @@ def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
 
 
 def depth_sigma(depth: NDArray[np.floating]) -> Float64:
-    """Assumed sigma [m] of depths (...) [m]: constant plus quadratic, as disparity errs."""
+    """Assumed sigma [m] of depths (...) [m]: constant plus quadratic."""
     return np.asarray(fixed.CALIBRATION_NOISE[0] + fixed.CALIBRATION_NOISE[1] * np.square(depth), np.float64)
 
 
 def tiles_of(pixels: Index, shape: tuple[int, ...]) -> Index:
-    """Each pixel's tile (K,), of `CALIBRATION_TILES` rows and columns."""
+    """Tile (K,) of each pixel, among `CALIBRATION_TILES` rows and columns."""
     rows, columns = fixed.CALIBRATION_TILES
     v, u = np.divmod(pixels, shape[1])
     return np.asarray((v * rows // shape[0]) * columns + u * columns // shape[1], dtype=np.int64)

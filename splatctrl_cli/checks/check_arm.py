@@ -22,9 +22,10 @@ LATE = "synchronise the clocks, or shift the stamps: robot labels and replay com
 class ArmAgreement:
     """Measured minus rendered depth on the robot's pixels, in one camera's frames.
 
-    median [m]: within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance from it (within
-    0 and `ARM_COVER`), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR` behind. num_pixels: with
-    depth; num_frames: with joint states. scale: measured over rendered depth, if one fits most.
+    median [m]: of differences within `ARM_NEAR`, positive if measured behind the surface. misfit [m]: mean distance
+    from the median (within 0 and `ARM_COVER`), each cut at `ARM_NEAR`. seen_through: share more than `ARM_NEAR`
+    behind. num_pixels: with depth; num_frames: with joint states. scale: measured over rendered depth, if one ratio
+    fits most.
     """
 
     median: float
@@ -91,7 +92,7 @@ def arm_agreement(
 def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[float, float] | None:
     """Best clock offset [s] of a camera against the joint states, and its misfit [m].
 
-    None if other offsets fit about as well, or the best fits badly or lies at the edge.
+    None if other offsets fit about as well, or the best fits badly or lies at the search's edge.
     """
 
     def misfit(offset: float) -> float:
@@ -131,9 +132,9 @@ def motion_findings(
     model: RobotModel | None,
     units: Iterable[float | None] = (None,),
 ) -> list[Finding]:
-    """Findings on joint states (in the model's order, if any) against the cameras.
+    """Findings that compare joint states (model order, if any) with the cameras.
 
-    frames: reduced, a few per camera; motion: of each camera's first images; units: as for `rescale_remedy`.
+    frames: reduced, a few per camera. motion: in each camera's first images. units: [m] per count of depth, or None.
     """
     offsets, findings = ({}, []) if model is None else _arm_findings(model, frames, states, units)
     if offsets:
@@ -232,7 +233,7 @@ def _own_offsets(
 def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> str:
     """Remedy that names two joints to exchange.
 
-    The arm is then where depth shows it; empty without such a pair.
+    The arm is then where depth shows it. Empty without such a pair.
     """
     few = spread(thin_frames(frames), limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)

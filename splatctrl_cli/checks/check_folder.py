@@ -53,11 +53,11 @@ def judge_frames(
     is_guessed: bool = False,
     only_errors: bool = False,
 ) -> CheckReport:
-    """Add findings on frames, and on frames against states, to a report.
+    """Add findings on frames, alone and compared with states, to a report.
 
     frames: reduced, a few per camera with known poses. depth_units: [m] per count by camera, None for floats. motion:
-    of the first images. states: in the model's order. cut: why not all was read. is_guessed: the unit of lengths is.
-    only_errors: skip checks that yield only notes and warnings.
+    in the first images. states: in the model's order. cut: why not all was read. is_guessed: True if the unit of
+    lengths is. only_errors: skip checks that find only notes and warnings.
     """
     findings = [*report.findings, *alignment_findings(frames)]
     usable, is_still = usable_frames(frames, findings), report.start_ns is None
@@ -117,7 +117,7 @@ def exposure_findings(frames: Sequence[RgbdFrame]) -> Iterator[Finding]:
 
 
 def _rows(bands: BandRatios, gains: Float64) -> Float64:
-    """Log brightness (N, B) by bands of rows, less a parabola: gloss varies slowly."""
+    """Log brightness (N, B) by bands of rows, minus a parabola for slowly varying gloss."""
     gains_by_band = bands.gains(np.ones(bands.num_images, np.bool_))
     logs = np.log(gains_by_band).mean(axis=2)
     if bands.misfit(gains_by_band) > limits.EXPOSURE_LEFT * bands.misfit(gains):
@@ -155,7 +155,7 @@ class _CameraWatch:
             self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
 
     def frames(self, camera: str) -> list[RgbdFrame]:
-        """Kept images with poses, paired by number, as a folder may have no clock."""
+        """Kept depth images with poses; colour pairs by number, because folders may lack clocks."""
         poses = dict(zip(self.stamps, self.poses, strict=True))
         return [
             RgbdFrame(

@@ -35,7 +35,7 @@ class Thumbnail:
 class ImageWatch:
     """Statistics of a topic's or camera's images, in bounded memory.
 
-    The first `limits.DECODED_IMAGES` are decoded, then ever fewer. thumbnails: stamp [ns] and image of
+    The first `limits.DECODED_IMAGES` are decoded, later images ever fewer. thumbnails: stamp [ns] and image of
     `limits.THUMBNAIL_COLUMNS` columns, depth (h, w) [m] or colour (h, w, 3).
     """
 
@@ -361,7 +361,7 @@ def _correlate(edges: Sequence[tuple[Float64, Float64]]) -> Float64:
 
 
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
-    """Rows and columns of the best shift, its correlation, and the best away from it."""
+    """Best shift [rows], [columns], its correlation, and the best correlation away from it."""
     height, width = surface.shape
     rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[

@@ -81,9 +81,9 @@ _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 
 
 class LogWatch(JoinedLog):
-    """A log that observes messages read by another, decoding images as needed.
+    """A log that observes its messages as they are read, decoding images as needed.
 
-    num_images: reading ends at this many of a topic. spans: first and last log time [ns] by file.
+    num_images: reading ends after this many images of a topic. spans: first and last log time [ns] by file.
     """
 
     def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
@@ -177,7 +177,7 @@ class LogWatch(JoinedLog):
 
 
 def ready(log: RawLog, log_survey: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
-    """The camera as `ingest` builds it, or None (rig.missing says why)."""
+    """The camera as `ingest` builds it, or None if it cannot."""
     with suppress(InputError):
         return build_cameras(log, log_survey, replace(options, cameras=(topics.name,)))[0]
     return None
@@ -193,7 +193,8 @@ def reduced_frames(
 ) -> list[RgbdFrame]:
     """Reduced frames of a camera, with kept depth and known pose.
 
-    color is black without one at depth's time. late_ns: delay of frames' stamps against transforms, by camera.
+    Colour is black without an image at the depth's time. late_ns: delay of frames' stamps against transforms, by
+    camera.
     """
     depths, colors = images.get(topics.depth), images.get(topics.color)
     sampled_colors = {small.stamp_ns: small for small in (colors.samples if colors is not None else ())}
@@ -291,7 +292,7 @@ def check_log(
 ) -> CheckReport:
     """Check `log` in one pass and bounded memory; at most `num_images` per topic.
 
-    Raises InputError for unfitting options.
+    Raises InputError for options that fit no log.
     """
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)

@@ -53,8 +53,8 @@ class Spread:
 class PoseAgreement:
     """Logged end-effector poses against forward kinematics.
 
-    difference: from `link`, the nearest. offset (4, 4): the constant transform that explains most, T_link_ee of a
-    tool or T_logged_base of a wrong base. rest: the difference that remains.
+    difference: from `link`, which explains the poses best. offset (4, 4): the constant transform that explains most,
+    T_link_ee of a tool or T_logged_base of a wrong base. rest: the difference that remains.
     """
 
     verdict: PoseVerdict
@@ -110,7 +110,7 @@ def check_states(states: StateColumns, joints: Sequence[str]) -> None:
 
 
 def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> None:
-    """Raise InputError for positions (model order) far beyond limits that fit as degrees."""
+    """Raise InputError if positions (model order) far exceed limits, but fit as degrees."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     if not len(states) or not limited.any():
         return
@@ -149,7 +149,7 @@ def _unit_remedy(names: Sequence[str]) -> str:
 def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
     """Agreement of logged poses in `states` (model order) with the best link; None without poses.
 
-    A constant difference in a link's frame is a tool, in the world a wrong base, any other another robot.
+    A constant difference in a link's frame means a tool; in the world, a wrong base. Any other means another robot.
     """
     posed = _posed(states)
     if not len(posed):
@@ -226,9 +226,9 @@ def _cost(spread: Spread) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotStates:
-    """Joint states, in the model's order if any, and findings.
+    """Joint states (model order, if any), and findings.
 
-    Without states, `lack` says why. The model is as the states move it.
+    lack: why there are no states. model: with the joints that the states move.
     """
 
     model: RobotModel | None
@@ -333,7 +333,7 @@ def stream_findings(where: str, stream: JointStream) -> Iterator[Finding]:
 
 
 def robot_findings(model: RobotModel, states: Sequence[JointState]) -> list[Finding]:
-    """Findings of states (model order) against limits, and of logged poses against FK."""
+    """Findings of states (model order) against limits, and of logged poses against forward kinematics."""
     try:
         check_angles(model, states, JOINT_STATES)
     except InputError as wrong:

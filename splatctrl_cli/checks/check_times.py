@@ -26,7 +26,7 @@ class Thinned(list[T]):
         self._limit, self._step, self._num = limit, 1, 0
 
     def is_next(self) -> bool:
-        """True if the next value is kept; call once each, before `add`."""
+        """True if the next value is kept; call once per value, before `add`."""
         is_kept = self._num % self._step == 0
         self._num += 1
         return is_kept
@@ -92,7 +92,7 @@ class TimesWatch:
         return float(np.median(self.delays[:, 1])) if self._delays and not self.num_zero else None
 
     def gaps(self) -> list[tuple[float, int]]:
-        """Intervals [s] far above the median, with the stamp before each; none without a rate."""
+        """Intervals [s] far above the median, with the stamp before each; none without a steady rate."""
         median = self.median_interval
         if median is None or float(np.quantile(self._intervals, 0.9)) > limits.REGULAR * median:
             return []  # no steady rate
@@ -251,7 +251,7 @@ def peer_findings(topics: list[TimesWatch]) -> Iterator[Finding]:
 
 
 def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
-    """Header stamps against log times: another clock, offset, drift."""
+    """Findings of header stamps against log times: another clock, offset, drift."""
     stamped = [(t, t.delay) for t in topics if t.delay is not None and t.count > 1]
     if not stamped:
         return []

@@ -42,9 +42,9 @@ def check_views(
 ) -> tuple[list[Finding], list[RgbdFrame], list[RgbdFrame]]:
     """Compare views from different places, of one moment or a static scene.
 
-    Returns the findings, the frames at fitting scales, and those at fitting poses too. used: metres per count of
-    depth by camera, None for floats. is_sure: False if the unit is doubtful; views must then meet. only_errors skips
-    wrong poses.
+    Returns findings, frames at fitting scales, and those at fitting poses. used: metres per count of depth by camera,
+    None for floats. is_sure: False if the unit is doubtful; views must then overlap. only_errors: seek wrong poses
+    only if scales are wrong.
     """
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)
@@ -66,7 +66,7 @@ def check_views(
 
 
 def are_far(frames: Sequence[RgbdFrame]) -> bool:
-    """True if camera distances, against depth, suggest another unit."""
+    """True if distances between cameras, relative to depth, suggest another unit."""
     medians = [float(np.median(seen)) for frame in frames if (seen := frame.depth[frame.depth > 0]).size]
     places = np.array([frame.T_world_camera[:3, 3] for frame in frames])
     return bool(medians) and float(np.linalg.norm(np.ptp(places, axis=0))) > limits.VIEWS_FAR * float(
@@ -75,7 +75,7 @@ def are_far(frames: Sequence[RgbdFrame]) -> bool:
 
 
 def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
-    """Depth factor by camera that makes views agree: one for all, else by camera."""
+    """Depth factors by camera that make views agree; one common factor, if that suffices."""
     cameras = sorted({view.camera for view in views})
     together = _best_scale(views, pairs, cameras)
     if together is not None:
@@ -92,7 +92,7 @@ def wrong_scales(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -
 
 
 def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> list[Move]:
-    """Cameras that fit the others much better after a small move, largest gain first."""
+    """Small moves after which a camera fits the others much better, largest gain first."""
     cameras = sorted({view.camera for view in views})
     moves: list[Move] = []
     for _ in range(max(1, len(cameras) // 2)):
@@ -126,7 +126,7 @@ def wrong_poses(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) ->
 def _overlap_findings(
     views: Sequence[DepthView], pairs: Sequence[tuple[int, int]], used: Mapping[str, float | None], *, is_sure: bool
 ) -> list[Finding]:
-    """Findings of unusual depths at which views would meet at a tenth or ten times."""
+    """Findings of unusual depths whose views would agree at a tenth or ten times."""
     low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
     if not len(depths) or (is_sure and low <= float(np.median(depths)) <= high):
@@ -254,7 +254,7 @@ def _landed(
 
 
 def _distances(a: DepthView, b: DepthView, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
-    """Distances [m] of view a's points from view b's planes, and depth."""
+    """Distances (K,) [m] of view a's points from view b's planes, and depths (K,) [m]."""
     points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
     lands &= np.any(normals != 0, axis=1)
     return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
@@ -295,7 +295,7 @@ def _fitting(
     scale: float,
     share: float = 1.0,
 ) -> tuple[int, int]:
-    """Points within `share` of `VIEWS_FIT` at a scale, and all that land."""
+    """Numbers of points within `share` of `VIEWS_FIT` at a scale, and of all that land."""
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
@@ -347,7 +347,7 @@ def _rows(a: DepthView, b: DepthView, camera: str) -> tuple[Float64, Float64]:
 
 
 def _cost(views: Sequence[DepthView], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Mean distance [m], cut at `limits.MOVE_CUT`, and share of fitting points."""
+    """Mean distance [m], cut at `limits.MOVE_CUT`, and share of points that fit."""
     total = num = num_good = 0.0
     for i, j in pairs:
         off, depth = _distances(views[i], views[j])

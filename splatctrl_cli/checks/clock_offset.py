@@ -1,6 +1,6 @@
 """Offset between a robot's clock and its cameras', by the motion both record.
 
-Image changes between frames are compared with those that a moving robot of spheres predicts.
+Image changes between frames are compared with changes that a moving robot of spheres predicts.
 """
 
 from collections.abc import Sequence
@@ -62,9 +62,9 @@ def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) ->
 
 
 def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) -> Float32:
-    """Depth (T, h, w) [m] of spheres (T, S, 3); 0 = none.
+    """Depth (T, h, w) [m] of spheres (T, S, 3); 0 where none is.
 
-    A sphere is a disc of its radius (S,) at its distance, exact on the optical axis.
+    A sphere of radius (S,) is projected in parallel at its distance, exact on the optical axis.
     """
     intrinsics = camera.intrinsics
     centers = transform_points(invert_transform(camera.T_world_camera), centers_world)
@@ -84,14 +84,14 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 
 
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
-    """Change (K, h, w) of silhouettes; 1 where only one has the robot."""
+    """Change (K, h, w) of silhouettes; 1 where only one image shows the robot."""
     a, b = depth_a > 0, depth_b > 0
     of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Pearson correlation, by sums (same at any thread count); 0 if one is constant."""
+    """Pearson correlation by sums, the same at any thread count; 0 for constant input."""
     x, y = np.asarray(a, dtype=np.float64).ravel(), np.asarray(b, dtype=np.float64).ravel()
     x, y = x - x.mean(), y - y.mean()
     length = float(np.sqrt(np.sum(x * x)) * np.sqrt(np.sum(y * y)))
@@ -106,7 +106,7 @@ RobotPoints = tuple[Float64, Float64]
 class ClockOffset:
     """The offset of two clocks, and its certainty.
 
-    offset_s: a frame's stamp minus the joint state's at that instant [s], None if unknown, for `reason`.
+    offset_s [s]: a frame's stamp minus the joint state's at that instant; None if unknown, for `reason`.
     uncertainty_s: the larger of camera disagreement and the method's error. correlation: at the best peak.
     """
 
@@ -131,9 +131,9 @@ def estimate_clock_offset(
 ) -> ClockOffset:
     """The offset at which robot and image motion correlate best.
 
-    states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette;
-    else, coarser, whole images with joint motion. The offset is the parabolic peak of the mean over cameras; unknown
-    without motion, at low correlation, with a rival peak, or at the search's end.
+    states: by stamp. With `robot` and stationary cameras, pixel changes are compared with the spheres' silhouette.
+    Otherwise, coarser, whole images are compared with joint motion. The offset is the parabolic peak of the mean over
+    cameras. It is unknown without motion, at low correlation, with a rival peak, or at the search's end.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)
@@ -165,7 +165,7 @@ def estimate_clock_offset(
 
 
 def select_states(stamp_ns: Stamps, motion: ImageMotion) -> Index:
-    """Indices (K,) of states, with ascending stamps (T,), that suffice for `estimate_clock_offset`."""
+    """Indices (K,) of states that suffice for `estimate_clock_offset`. stamp_ns (T,): ascending."""
     cameras = [camera for camera in motion.cameras.values() if camera.changes]
     if not cameras:
         return np.zeros(0, dtype=np.int64)
@@ -193,7 +193,7 @@ def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
 
 
 def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
-    """Offsets [s] to try over `span_s`, none if too short, and their step."""
+    """Offsets [s] to try over `span_s`, and their step [s]; none if it is too short."""
     step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / limits.OFFSET_STEPS
     count = int(min(limits.OFFSET_REACH, limits.OFFSET_SHARE * span_s) / step) if step > 0 else 0
     if count < 2 * limits.OFFSET_STEPS:

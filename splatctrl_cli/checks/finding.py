@@ -12,7 +12,7 @@ from splatctrl_cli.records import RgbdFrame
 
 
 class Severity(StrEnum):
-    """Error: a later command fails or errs; warning: a loss or doubt; note: no fault."""
+    """Error: a later command fails or errs. Warning: loss or doubt. Note: no fault."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -150,7 +150,7 @@ CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 class Finding:
     """One finding: `code` is its entry in `CHECKS`, `where` the topic, camera or joint.
 
-    value: the figure, in `unit`; stamp_ns: first occurrence; both None without one.
+    value: the figure, in `unit`, or None. stamp_ns: first occurrence, or None.
     """
 
     severity: Severity
@@ -191,15 +191,15 @@ ERROR, WARNING, NOTE = ORDER
 
 
 def judge(severity: Severity | None, code: str, where: str, what: str, *remedy: str, **figure: Any) -> list[Finding]:
-    """One finding, or none without a severity; `remedy` and `figure` (value, unit, stamp_ns) as of `Finding`."""
+    """One finding, or none without a severity; `remedy` and `figure` (value, unit, stamp_ns): fields of `Finding`."""
     return [] if severity is None else [_finding(severity, code, where, what, *remedy, **figure)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """A row of the rates. is_read: by later commands; hz: median.
+    """A topic's timing. is_read: by later commands. hz: from the median interval.
 
-    longest_s: between stamps; delay_s: median log time minus stamp.
+    longest_s: interval between stamps. delay_s: median log time minus stamp.
     """
 
     topic: str
@@ -239,7 +239,7 @@ class CheckReport:
         return [f for f in self.sorted_findings if f.severity is ERROR and command in CHECKS[f.code].blocked]
 
     def obstacles(self, command: str) -> list[str]:
-        """Needs a command lacks, and errors that block it; empty if it can start."""
+        """Missing data and errors that block a command; empty if it can start."""
         blocking = (f"{f.where}: {f.what} [{f.code}]" for f in self.blockers(command))
         return [*filter(None, [self.lacks[command]]), *blocking]
 
@@ -280,7 +280,7 @@ class CheckReport:
 
 
 def find_lacks(*, num_cameras: int, num_frames: int, states_lack: str) -> dict[str, str]:
-    """Needs each later command lacks, errors aside. states_lack: why states are missing."""
+    """Missing data by later command. states_lack: why states are missing."""
     is_too_short = num_cameras == 1 and 0 < num_frames < 3
     few = "one camera and less than three frames: nothing can be held out; record more views" if is_too_short else ""
     return dict.fromkeys(ALL, "") | {"score": few, "replay": states_lack}

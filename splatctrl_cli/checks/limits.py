@@ -1,6 +1,6 @@
 """Sample sizes and thresholds of `splatctrl check`.
 
-A unit in brackets precedes the meaning; others are shares, factors or counts.
+A unit in brackets precedes the meaning. Other numbers are shares, factors or counts.
 """
 
 # Cameras: lenses, poses and pairs of images

@@ -60,13 +60,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class OfThisProgram:
-    """Command line of nodes that run this program; `threads` for each."""
+    """Command line of nodes that run this program, each with `threads`."""
 
     entry: ClassVar[str] = "splatctrl_cli.cli.batch:run_words"
     threads: int
 
     def parsed(self, command: str, options: Table, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...]]:
-        """Words for options by long name, and files among them. Raises UsageError for unknown ones."""
+        """Words for options by long name, and files among them. Raises UsageError for unknown options."""
         parser, places, words = _parser_of(command), list[str](), [command]
         values_by_name = {"threads": self.threads, **options}
         known = [name for name in values_by_name if name not in OWN or f"--{name}" in parser._option_string_actions]

@@ -1,6 +1,6 @@
 """Subcommands with examples, options, and functions by name.
 
-A function's imports wait until it runs, so that help answers at once.
+A function is imported when it runs, so that help answers at once.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 class Command:
     """A subcommand or action; `run` names MODULE:FUNCTION of this package.
 
-    With `actions` it has no options. judges: ends in a verdict.
+    A command with `actions` has no options. judges: ends in a verdict.
     """
 
     summary: str

@@ -28,7 +28,7 @@ SEVERAL_LOGS = "several logs of one session are read as one"
 
 
 def request_of(kind: type[T], args: argparse.Namespace, **fields_given: Any) -> T:
-    """Build a request, its configuration and nested options: `given` fields, else options, else defaults.
+    """Build a request from `fields_given`, else options, else defaults, including nested requests.
 
     Raises UsageError for a wrong value.
     """
@@ -389,7 +389,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
 
 
 def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[object]]]) -> Iterator[str]:
-    """`table` of rows made twice, first for widths, to bound memory."""
+    """Lines of a `table` in bounded memory: `rows` is called twice, first for widths."""
     widths, is_number = [len(name) for name in header], [True] * len(header)
     for row in rows():
         for i, cell in enumerate(map(str, row)):

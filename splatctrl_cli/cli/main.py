@@ -71,7 +71,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _fail(error: BaseException, words: Sequence[str], *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
-    """Print an error on stderr (with --json on stdout); return line and exit code."""
+    """Print an error on stderr (with --json also on stdout); return line and exit code."""
     message, remedy, code = _explain(error)
     if code == INTERRUPTED and remedy.endswith(RESUME):
         goes_on = shlex.join([words[0], RESUME, *(word for word in words[1:] if word != RESUME)])
@@ -135,7 +135,6 @@ def _stand_in_for_closed_streams() -> _Lost:
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Refuse an unwritable output or report; a refused report is not written."""
     out, report = getattr(args, "out", None), getattr(args, "junit", None)
     values = [value for name, value in vars(args).items() if name not in ("out", "junit")]
     arguments = [each for value in values for each in (value if isinstance(value, list) else [value])]
@@ -179,7 +178,7 @@ def _places(output: Path) -> set[Path]:
 def refuse_endless_files() -> None:
     """Make reading a FIFO, socket or device raise OSError from now on, anywhere.
 
-    A FIFO would wait for its writer, /dev/zero fill the memory.
+    A FIFO would wait for its writer; /dev/zero would fill the memory.
     """
     sys.addaudithook(_look)
 

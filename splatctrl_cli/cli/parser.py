@@ -128,7 +128,7 @@ class Parser(argparse.ArgumentParser):
 
 
 Adds = Callable[[Any], None]
-"""An option, or a group of them, which a parser or a group of one is given to be added to."""
+"""A function that adds options to a parser or to a parser's group."""
 
 
 def option(
@@ -144,8 +144,8 @@ def option(
     """Declare ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
 
     kind: converts the text, or a tuple of choices. default: shown in the help. fields: of a request, each with a
-    function of the option's value, or its MODULE:NAME if heavy (default: the field of its name). sets: a key of the
-    configuration, which says the kind. more: as in argparse.
+    function of the option's value, or the function's MODULE:NAME if heavy. Default: the field of its name. sets: a
+    key of the configuration, which implies the kind. more: arguments of argparse.
     """
     if sets is not None:
         declared, of_default = sets[0].declared[sets[1]], type(getattr(*sets))
@@ -234,7 +234,7 @@ def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
 
 
 def several(text: str) -> tuple[float, ...]:
-    """Numbers joined by commas; none if one is invalid or beyond `MAX_PLACE`."""
+    """Numbers joined by commas; empty if any is invalid or beyond `MAX_PLACE`."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.query.query import QueryRequest, query
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Run; without an output answers go to stdout, figures to stderr."""
+    """Run `query`; without --out, print answers to stdout and figures to stderr."""
     request = request_of(QueryRequest, args)
     if args.out is not None or console.is_json:
         result = query(request, console)

@@ -121,7 +121,7 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
 
 
 def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
-    """Figures by view, or by scan, with their mean, and what they mean."""
+    """Figures by view or scan, with their mean and definitions."""
     metrics, scans = report["metrics"], report.get("results", {})
     views = [] if scans else report["views"]
     columns = [name for name in COLUMNS if name in (metrics if scans else views[0])]

@@ -61,9 +61,9 @@ def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> N
 def tell_of_failure(
     words: Sequence[str], args: argparse.Namespace | None, line: str, code: int, start: float
 ) -> None:
-    """Report a command without a verdict; if that fails too, print why.
+    """Report a command without a verdict; if reporting fails, print why.
 
-    args: None for unparsed words. start: by time.perf_counter.
+    args: None for unparsed `words`. start: by time.perf_counter.
     """
     args = args or argparse.Namespace(command=words[0], junit=_junit_in(words), began=start)
     try:

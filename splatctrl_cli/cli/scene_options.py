@@ -40,7 +40,7 @@ CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "har
 
 
 def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
-    """Log and cameras of ``LOG:camera,...``; none means all that did not train."""
+    """Log and cameras of ``LOG:camera,...``; without names, all cameras that did not train."""
     path, colon, cameras = text.rpartition(":")
     if not colon or Path(text).exists():
         return Path(text), ()

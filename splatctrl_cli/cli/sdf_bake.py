@@ -98,6 +98,6 @@ def _errors(band: Band, figures: Sequence[str] = ERRORS) -> list[object]:
 
 
 def labels_of(text: str) -> frozenset[Label]:
-    """Labels in a field: objects and those of ``--include``. Raises UsageError for others."""
+    """Labels in a field: objects, and ``--include``'s. Raises UsageError for other labels."""
     names = () if text.strip() == "none" else names_of("--include", ("robot", "human"), text)
     return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})

@@ -169,7 +169,6 @@ class PolicyClient:
         self._opened.close()
 
     def _observe(self, question: Document) -> Document:
-        """The observation by key; a camera without an image yet is left out."""
         images, observation = self._images.at(question["stamp_ns"]), dict[str, Any]()
         for key, value in self._observed.items():
             camera = value.removeprefix(IMAGE)

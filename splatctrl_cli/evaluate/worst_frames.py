@@ -123,7 +123,6 @@ def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
 
 
 def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
-    """Row and column of a point, camera frame; None outside."""
     if not np.isfinite(point).all() or point[2] <= NEAR:
         return None
     column, row = (round(float(v)) for v in _pixel(point, intrinsics, 1))
@@ -153,7 +152,6 @@ def _ring(center: Float64, radius: float, intrinsics: Intrinsics, zoom: int) -> 
 
 
 def _fill(picture: UInt8, rings: Sequence[list[Int32]], color: tuple[int, int, int]) -> None:
-    """Tint the union of the rings in place, and outline it."""
     mask = np.zeros(picture.shape[:2], np.uint8)
     for ring in rings:
         cv2.fillPoly(mask, ring, 255, cv2.LINE_8, SHIFT)

@@ -81,7 +81,7 @@ _WITHOUT_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.
 
 @contextmanager
 def lock_output(partial: Path, *, is_folder: bool) -> Iterator[None]:
-    """Lock a partial output for the block; create it if missing.
+    """Lock a partial output during the block; create it if missing.
 
     The lock follows a rename, and ends with the process. Without flock(2) nothing is locked. Raises UsageError if
     another run has the lock.
@@ -180,11 +180,10 @@ def output_path(
 ) -> Iterator[Path]:
     """Yield ``NAME.partial`` (an empty folder, or a file name); rename it to `path` on success.
 
-    A failure removes it; an interrupted run leaves it. With the file `checkpoint` in it, a failure to write or of a
-    card leaves it, too. `resume` yields such a folder, and no failure removes it. A link `path` stays, and its target
-    is written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind. Also for a
-    foreign folder, another writer, or an unwritable parent. Raises WriteError if `is_write_failure`; other errors
-    pass.
+    A failure removes it; an interrupted run leaves it. If it contains the file `checkpoint`, failed writes and device
+    faults leave it, too. `resume` yields such a folder, and no failure removes it. If `path` is a link, its target is
+    written. Raises UsageError if `path` has no name, exists without `force`, or is of the wrong kind. Also for a
+    foreign folder, another writer, or an unwritable parent. Raises WriteError if writing failed; other errors pass.
     """
 
     def can_go_on() -> bool:
@@ -243,7 +242,7 @@ def partial_path(path: Path) -> Path:
 
 
 def check_can_be_written(path: Path) -> None:
-    """Raise UsageError early if the nearest folder is not writable."""
+    """Raise UsageError early if the nearest existing folder is not writable."""
     try:
         above = next(folder for folder in follow_link(path).absolute().parents if folder.exists())
         is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
@@ -344,7 +343,7 @@ def write_run(
 ) -> None:
     """Write ``run.json``: command, settings, sha256 of inputs, times, metrics and verdict.
 
-    Write it last: for WITH_PARTS it has the sha256 of every file, checked on opening. It omits ``--resume``.
+    Write it last: for commands in WITH_PARTS it lists every file's sha256, checked on opening. It omits ``--resume``.
     """
     run = {
         "command": command,

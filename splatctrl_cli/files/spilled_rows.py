@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def scratch_folder() -> Path:
-    """Folder for unnamed files: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else any."""
+    """Folder for unnamed files: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else the default."""
     folder, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
     return Path(tempfile.gettempdir()) if folder or not os.access(on_disk, os.W_OK) else on_disk
 
@@ -32,7 +32,7 @@ def ranges(num: int) -> Iterator[tuple[int, int]]:
 
 
 class RowFile:
-    """Rows of one shape, appended; reads return copies, nothing is mapped."""
+    """Rows of one shape, appended; reads return copies without memory mapping."""
 
     def __init__(
         self, shape: tuple[int, ...] = (), blocks: Iterable[Float64] = (), dtype: DTypeLike = np.float64
@@ -188,7 +188,7 @@ Table = Float64 | Rows
 
 
 def select(table: Table, index: Index | None = None, columns: Index | None = None) -> Table:
-    """Rows and columns by index, in its order; a file is not read yet."""
+    """Rows and columns in the order of their indices; files are read later."""
     if isinstance(table, Rows):
         return table.select(index, columns)
     rows = table if index is None else table[index]

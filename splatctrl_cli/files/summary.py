@@ -1,6 +1,6 @@
 """The shape of `info`'s answer, and names in folders of millions of files.
 
-Names are text: paths cost ten times more.
+Names are strings: Path objects cost ten times more.
 """
 
 import os

@@ -211,7 +211,6 @@ def _goal(request: ReplayRequest) -> list[str]:
 
 
 def _open_folder(request: AuditRequest) -> dict[str, list[str]]:
-    """Make the folder; return the steps done in it, none with `force`."""
     out, file, other = request.out, request.out / STEPS, "give another --out"
     with refuse_faults(
         lambda error: f"{out}: cannot be written: {error.strerror}", OSError, remedy=other, error=UsageError

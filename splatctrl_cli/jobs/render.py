@@ -125,7 +125,6 @@ def _camera(request: RenderSceneRequest, scene: SceneFolder) -> tuple[Intrinsics
 
 
 def _resize(lens: Intrinsics, width: int, height: int) -> Intrinsics:
-    """Camera of another image size, with the same vertical view and middle ray."""
     factor = height / lens.height
     return Intrinsics(
         fx=factor * lens.fx,

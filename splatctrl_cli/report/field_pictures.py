@@ -69,10 +69,10 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
 def field_slice_picture(
     path: Path, grid: DistanceGrid, height: float, spheres: tuple[Float64, Float64], title: str
 ) -> None:
-    """Write the slice of `sdf` nearest to z = `height` [m], where the channel `observed` is.
+    """Write the slice of `sdf` nearest to z = `height` [m]; needs channel `observed`.
 
     Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] show
-    as circles. Raises NotEvaluableError outside the grid.
+    as circles. Raises NotEvaluableError for a height outside the grid.
     """
     first, num = float(grid.origin[2]), grid.channels["sdf"].shape[2]
     refuse_if(
@@ -132,7 +132,7 @@ def gradient_picture(
 ) -> None:
     """Write the gradient's length in a slice across z, and its histogram over the grid.
 
-    histogram: cells by length, bin k about k times `bin_width`, the last for all longer.
+    histogram: number of cells by length. Bin k is about k times `bin_width`, the last also above.
     """
     (cut,) = _cuts(grid, point, axes=(2,))
     sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
@@ -267,7 +267,7 @@ def reliability(probability: Float64, is_colliding: Bool, bins: int = 10) -> Rel
 
 
 def reliability_picture(path: Path, curves: Mapping[str, Reliability], title: str = "Reliability") -> None:
-    """Write collided share over predicted probability by form, and points per bin.
+    """Write each curve's collided share over predicted probability, and points per bin.
 
     A calibrated probability lies on the diagonal.
     """

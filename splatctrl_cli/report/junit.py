@@ -39,7 +39,7 @@ WORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One criterion or gate. group: recording and command, unique with the name.
+    """One criterion or gate. group: recording and command; unique with the name.
 
     sentence: the finding in one line; text: in full; seconds: 0 if not timed.
     """
@@ -54,7 +54,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """A recording's cases. path: file or folder; notes: decide nothing; started: ISO 8601."""
+    """A recording's cases. path: file or folder; notes: without effect; started: ISO 8601."""
 
     name: str
     cases: Sequence[Case]
@@ -71,7 +71,7 @@ class Suite:
 def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed") -> list[Case]:
     """A case per criterion of a verdict (`Verdict.as_dict`, or a command's JSON).
 
-    expected: outcome other than "passed" with which every case passes.
+    expected: outcome; if it is not "passed" and occurs, every case passes.
     """
     reasons = verdict["reasons"]
     names = dict.fromkeys(reason["criterion"] for reason in reasons)
@@ -108,7 +108,7 @@ def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[
 
 
 def worst_first(suites: Iterable[Suite]) -> list[tuple[Suite, Case]]:
-    """Cases not passed, with suites: failed, error, not evaluable, skipped."""
+    """Cases not passed, with suites, worst first: failed, error, not evaluable, skipped."""
     cases = [(suite, case) for suite in suites for case in suite.cases if case.kind is not Kind.PASSED]
     return sorted(cases, key=lambda pair: WORST_FIRST.index(pair[1].kind))
 
@@ -151,7 +151,7 @@ _NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_junit(path: Path, suites: Sequence[Suite]) -> None:
     """Write the suites atomically to `path`, replacing a report.
 
-    Raises UsageError for another file or path, WriteError on a full disk.
+    Raises UsageError if `path` is no report, WriteError on a full disk.
     """
     check_replaceable(path)
     with output_path(path, force=True, is_folder=False) as partial:
@@ -221,7 +221,7 @@ def _add_case(suite: ElementTree.Element, case: Case) -> None:
 
 
 def _counts(suites: Sequence[Suite]) -> dict[str, str]:
-    """Count failures and errors. Not evaluable is an error: nothing was proven."""
+    """Count failures and errors. Not evaluable counts as an error: nothing was proven."""
     return {
         "tests": str(sum(len(suite.cases) for suite in suites)),
         "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),
@@ -241,7 +241,7 @@ MORE = "\n... and {} more that do not fit here\n"
 def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
     """Print annotations, and append a table to the step's summary, in GitHub Actions only.
 
-    is_fatal: else annotations are warnings. Raises OSError if the summary cannot be written.
+    is_fatal: if False, annotations are warnings. Raises OSError if the summary cannot be written.
     """
     if os.environ.get("GITHUB_ACTIONS") != "true":
         return

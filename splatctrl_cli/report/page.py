@@ -1,7 +1,7 @@
 """One self-contained HTML file: verdict, timelines, pictures, tables, and 3-D scenes.
 
-trimesh brings the viewer's three.js. A packed scene is JSON ``{"header": {...}, "bytes": "..."}``: deflated base64,
-and each array's type, first byte and count. Points are 16-bit integers within their box.
+The viewer's three.js is trimesh's. A packed scene is JSON ``{"header": {...}, "bytes": "..."}``, with deflated
+base64, and each array's type, first byte and count. Points are 16-bit integers within their box.
 """
 
 import base64
@@ -41,7 +41,8 @@ class Surface:
 class Motion:
     """An arm over T states: seconds (T,) from the first; poses (T, L, 4, 4), world.
 
-    bodies (L): by link, in its frame. path (T, 3) [m]: the end effector, world. clearance (T,) [m]: NaN if unknown.
+    bodies (L): by link, in the link's frame. path (T, 3) [m]: the end effector, world. clearance (T,) [m]: NaN if
+    unknown.
     """
 
     seconds: Float64
@@ -57,9 +58,9 @@ class Space:
     """Content of a 3-D page, world [m].
 
     splats: by motion time [s] from which they were known, the first from the start. unknown: centres (K, 3) and edge
-    of cubes without evidence, by its class. surface: where a baked distance is 0. deciding: the event's sentence,
-    time [s] and place, with center and radius of the arm's sphere there [m]. cameras: name, place `eye` [m], unit
-    vector `ahead` and vertical angle `fov` [degrees] of each one.
+    of cubes without evidence, by evidence class. surface: where a baked distance is 0. deciding: the event's
+    sentence, time [s] and place, with center and radius [m] of the arm's sphere. cameras: each one's name, place
+    `eye` [m], unit vector `ahead` and vertical angle `fov` [degrees].
     """
 
     splats: Mapping[float, SplatSet] = field(default_factory=dict)
@@ -84,7 +85,7 @@ class Space:
 
 
 def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
-    """A robot's collision geometry by link, as triangles in its frame."""
+    """A robot's collision geometry by link, as triangles in the link's frame."""
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for kind, size, T, link in zip(
         surface.kinds, surface.sizes, surface.T_link_solid, surface.solid_links, strict=True
@@ -103,7 +104,10 @@ def bodies_of(surface: RobotSurface) -> dict[str, Surface]:
 
 
 def _primitive(kind: float, size: Float64) -> "trimesh.Trimesh":
-    """size (3,): half edges; radius, half length of a cylinder or capsule; radius of a ball."""
+    """Mesh.
+
+    size (3,): half edges of a box; radius, half length of a cylinder or capsule; radius of a ball.
+    """
     if kind == BOX:
         return trimesh.creation.box(extents=2 * size)
     if kind == BALL:
@@ -239,7 +243,7 @@ class Cell:
 
 
 Row = tuple[Sequence[object], str]
-"""Values or `Cell`s of a table, and a state: the row is marked where that is a bad one."""
+"""Values or `Cell`s of a row, and its state; a bad state marks the row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,7 +259,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as data URL, with size [px] and title. over: a second one above it."""
+    """An image as data URL, with size [px] and title. over: a second image above it."""
 
     title: str
     data: str
@@ -266,7 +270,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSection:
-    """A run's section. space: its scene's name, or ""; no_space: why none."""
+    """A run's section. space: its 3-D scene's name, or ""; no_space: why none."""
 
     anchor: str
     title: str
@@ -284,7 +288,10 @@ class RunSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """A report. pictures: of runs without a section; scenes: `packed`; opens: the first at once."""
+    """A report.
+
+    pictures: of runs without a section; scenes: packed, by name; opens: show the first at once.
+    """
 
     title: str
     state: str

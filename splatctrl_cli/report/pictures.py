@@ -43,7 +43,7 @@ STYLE: Any = {  # matplotlib types its keys as one long literal
 class ComparisonRow:
     """A view's photo (H, W, 3) uint8, render in [0, 1], and depths (H, W) [m].
 
-    Depth 0 is none. `figures`: the render's quality in words; mask (H, W): pixels that count.
+    Depth 0 is missing. `figures`: the render's quality in words; mask (H, W): pixels that count.
     """
 
     title: str
@@ -75,9 +75,9 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 
 @contextmanager
 def drawn_figure(path: Path, height: float, description: str = "") -> Iterator["mpl.figure.Figure"]:
-    """A figure of the house style, 1200 pixels wide, written undated when the block ends.
+    """Yield a figure, 1200 pixels wide; write it without date when the block ends.
 
-    description: its description in the file.
+    description: text in the file's metadata.
     """
     with mpl.rc_context(STYLE):
         layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
@@ -162,7 +162,7 @@ HOLE = "#d55e00"  # recorded, but not rendered
 
 
 def view_picture(path: Path, row: ComparisonRow) -> None:
-    """Write photo | render over colour error | depth error, with the mask's outline."""
+    """Write photo and render above colour error and depth error, with the mask's outline."""
     height, width = row.photo.shape[:2]
     render = np.clip(row.render, 0.0, 1.0)
     color_error = np.asarray(100.0 * np.abs(render - row.photo / 255.0).mean(axis=2))

@@ -71,7 +71,7 @@ def clearance_picture(
 ) -> None:
     """Write clearance curves (T,) [m] over `seconds` (T,), with margin [m] and event strips.
 
-    NaN leaves gaps; below the margin is shaded, minima are marked.
+    NaN leaves gaps. Space below the margin is shaded, minima are marked.
     """
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(path, 4.8 + _strip_height(shown)) as figure:
@@ -135,7 +135,7 @@ def commands_picture(
 ) -> None:
     """Write commanded velocities (T, J) [rad/s] with limits (J,), over strips of interventions.
 
-    logged (T, J): drawn behind.
+    logged (T, J): velocities drawn behind.
     """
     height = 0.78 * len(joints)
     with drawn_figure(path, height + 0.6 + _strip_height(interventions)) as figure:
@@ -159,9 +159,9 @@ def commands_picture(
 def open_loop_picture(
     path: Path, seconds: Float64, difference: FloatRows, joints: Sequence[str], margin: FloatRows, shaped: Intervals
 ) -> None:
-    """Write commanded minus logged velocity (T, J) [rad/s], over the logged one's margin (T,) [m/s].
+    """Write commanded minus logged velocity (T, J) [rad/s], above the logged velocity's margin (T,) [m/s].
 
-    shaped: intervals [s] in which a row shaped the command, shaded.
+    shaped: shaded intervals [s] in which a barrier row changed the command.
     """
     room, largest = np.asarray(margin), 0.0
     times, lowest, _ = envelope(seconds, room)
@@ -290,8 +290,8 @@ def _tidy(axes: Any, seconds: Float64) -> None:
 def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> tuple[Float64, Float64, Float64]:
     """Ranges of values (T,) in `columns` equal parts of time (T,).
 
-    Returns middle times (K,) [s], lowest and highest values (K,), NaN if empty. Up to two states per column, both are
-    the values, one array.
+    Returns middle times (K,) [s], lowest and highest values (K,), NaN in empty parts. With at most two states per
+    column, both are the array `values`.
     """
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:
@@ -314,7 +314,7 @@ def column(rows: FloatRows, number: int) -> Float64:
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
     """Start and length [s] of intervals on the axis `span_s`.
 
-    At least `SHORTEST`; touching ones are joined.
+    Lengths are at least `SHORTEST` of it. Touching intervals are joined.
     """
     least = SHORTEST * (span_s[1] - span_s[0])
     drawn: list[tuple[float, float]] = []

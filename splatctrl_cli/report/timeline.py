@@ -58,7 +58,7 @@ def timeline(
 
 
 def runs_of(rungs: Sequence[str], seconds: Float64) -> list[tuple[str, float, float]]:
-    """Runs of equal rungs: rung, first time, next run's first time [s]."""
+    """Runs of equal rungs: rung, first time [s], and the next run's first time [s]."""
     runs, first = [], 0
     for rung, group in groupby(rungs):
         behind = first + len(list(group))

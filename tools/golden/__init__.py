@@ -1,1 +1,1 @@
-"""Digests of what the commands write, kept in digests.txt: whether a change of the code moves a figure."""
+"""Digests of the commands' outputs, stored in digests.txt, show if a code change alters a figure."""

@@ -1,8 +1,8 @@
 """Run the commands of cases.toml and compare digests of all that they write with digests.txt.
 
-``python -m tools.golden`` runs all of them, ``python -m tools.golden readme-replay`` one and what it needs. It ends
-with 1 where a digest changed. ``--write`` renews digests.txt; ``--out FOLDER`` keeps the outputs, to be compared by
-hand.
+``python -m tools.golden`` runs all of them; ``python -m tools.golden readme-replay`` runs one case and the cases that
+it needs. It ends with 1 if a digest changed. ``--write`` renews digests.txt; ``--out FOLDER`` keeps the outputs, to
+be compared by hand.
 """
 
 import argparse
@@ -34,7 +34,7 @@ LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "matplotlib", "pin", "c
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A command line without its program; the command before it, the cases and the recording that it needs."""
+    """A command line without its program, the command before it, and the cases and recording that it needs."""
 
     run: str
     before: str = ""
@@ -48,7 +48,7 @@ def read_cases(path: Path = CASES) -> dict[str, Case]:
 
 
 def ordered(cases: Mapping[str, Case], names: Sequence[str]) -> list[str]:
-    """`names`, or all where there are none, each after what it needs."""
+    """`names` (all, if empty), each after the cases that it needs."""
     found: dict[str, None] = {}
     for name in names or cases:
         if name not in cases:
@@ -59,7 +59,7 @@ def ordered(cases: Mapping[str, Case], names: Sequence[str]) -> list[str]:
 
 
 def run_case(name: str, case: Case, scratch: Path, places: Mapping[str, str]) -> dict[str, str]:
-    """Run it in `scratch`; digests of its exit code, its JSON and all that it wrote, by `case artefact`."""
+    """Run a case in `scratch`; return digests of its exit code, its JSON and its files, by `case artefact`."""
     program, environment = str(Path(sys.executable).with_name("splatctrl")), os.environ | AT_MOST_AVX2
     run = partial(subprocess.run, cwd=scratch, env=environment, capture_output=True, text=True)
     if case.before:
@@ -74,7 +74,7 @@ def run_case(name: str, case: Case, scratch: Path, places: Mapping[str, str]) ->
 
 
 def prepare(scratch: Path, recordings: Path) -> dict[str, str]:
-    """Links to what the commands read; what stands for the folders' paths in what they write."""
+    """Link the commands' inputs; return the names that replace the folders' paths in outputs."""
     folders = [ROOT / "sample_data", ROOT / "docs"]
     folders += sorted(path for path in recordings.iterdir() if path.is_dir()) if recordings.is_dir() else []
     for folder in folders:
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run_all(
     cases: Mapping[str, Case], names: Sequence[str], scratch: Path, kept: Mapping[str, str]
 ) -> dict[str, dict[str, str]]:
-    """Digests by case; cases whose recording is not there are left out, and said so."""
+    """Digests by case; cases without their recording are omitted with a message."""
     recordings = Path(os.environ.get("SPLATCTRL_REAL_DATA", ROOT.parent / "shared" / "data"))
     places = prepare(scratch, recordings)
     found: dict[str, dict[str, str]] = {}

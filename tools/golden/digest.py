@@ -1,4 +1,4 @@
-"""Digests of files, without what differs between two runs of the same code for a good reason."""
+"""Digests of files, without parts that rightly differ between two runs of the same code."""
 
 import hashlib
 import json
@@ -46,8 +46,8 @@ def stamps(folder: Path) -> dict[str, tuple[int, int]]:
 def written(folder: Path, before: Stamps, places: Mapping[str, str]) -> dict[str, str]:
     """Digest of each artefact below `folder` that is new or changed since `before`, by name.
 
-    A run.json is one artefact for each of its keys, many files alike in one folder are one artefact. `places`: what
-    stands for a path that differs between machines.
+    Each key of a run.json is one artefact; many similar files in one folder are one artefact. `places`: names that
+    replace paths that differ between machines.
     """
     names = sorted(name for name, stamp in stamps(folder).items() if before.get(name) != stamp)
     alike: dict[str, list[str]] = defaultdict(list)
@@ -72,7 +72,7 @@ def written(folder: Path, before: Stamps, places: Mapping[str, str]) -> dict[str
 
 
 def of_run_file(name: str, data: bytes, places: Mapping[str, str]) -> dict[str, str]:
-    """Digest of each key of a run.json, less `LEFT_OUT`, as `name:key`."""
+    """Digest of each key of a run.json, except `LEFT_OUT`, as `name:key`."""
     return {
         f"{name}:{key}": of_json(json.dumps(part), places)
         for key, part in json.loads(data).items()
@@ -81,7 +81,7 @@ def of_run_file(name: str, data: bytes, places: Mapping[str, str]) -> dict[str, 
 
 
 def of_json(text: str, places: Mapping[str, str]) -> str:
-    """Digest of a JSON value, less `LEFT_OUT`; of no text, where a command had nothing to say."""
+    """Digest of a JSON value without `LEFT_OUT`; of empty text if a command printed nothing."""
     lasting = json.dumps(_lasting(json.loads(text)), sort_keys=True) if text else ""
     return digest(_placed(lasting.encode(), places))
 

@@ -1,1 +1,1 @@
-"""The hunt for false greens: random hostile recordings with known truth, judged by the whole chain."""
+"""The hunt for false greens: random hostile recordings with known truth, judged by the whole tool."""

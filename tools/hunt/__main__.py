@@ -1,6 +1,6 @@
 """Run the hunt: ``python -m tools.hunt --runs 2000 --seed 0``. The same seed gives the same runs.
 
-The runs are a batch: those of a folder that no change of the code or of the hunt concerns are not run again.
+The runs are a batch. Finished runs in a folder are repeated only if the code or the hunt has changed.
 """
 
 import argparse
@@ -33,7 +33,7 @@ class Lines:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, and print the table; 1 where something observable in contact, or a crash, was called safe."""
+    """Run, and print the table; return 1 for an observable false green or a crash."""
     args = _parser().parse_args(arguments)
     if args.border:
         print("\n".join(f"{row.name}  {row.family}, {row.kind}" for row in border_of(read_rows(TABLE))))
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def one(words: list[str]) -> int:
-    """What a node runs: the run that its words name, and the device; its row and line go to stdout."""
+    """Run one node: the run and device that `words` name; print its row and line."""
     row = run(*_run_name(words[0]), device=words[1])
     label = (
         ("false green" if row.observable else "false green, not observable") if row.is_false_green else row.outcome
@@ -63,7 +63,7 @@ def one(words: list[str]) -> int:
 
 
 def preload() -> None:
-    """What a runner does once: a run, after which the coverage of the arm is known to all others."""
+    """Make one run per runner, so that later runs reuse the arm's coverage."""
     run(0, 0)
 
 
@@ -79,7 +79,7 @@ def _code() -> tuple[Path, ...]:
 
 
 def _row(out: Path, run: Run) -> Row:
-    """The row of a run; one of outcome `crash` where the tool raised what it must not."""
+    """The row of a run; its outcome is `crash` if the tool raised an unexpected error."""
     if run.state in (DONE, FAILED):
         return Row(**json.loads((out / run.result).read_text(encoding="utf-8"))["row"])
     seed, index = _run_name(run.node)

@@ -19,8 +19,8 @@ FAULTLESS = ("benign", "still")  # families
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """is_slim: visual shapes lie inside of the collision shapes; parts: names of the `UNMODELLED` parts that it has;
-    depth: how cameras measure it, None for nearly exact depth.
+    """is_slim: visual shapes lie inside of the collision shapes; parts: names of its `UNMODELLED` parts; depth: how
+    cameras measure it, None for nearly exact depth.
     """
 
     is_slim: bool = False
@@ -57,7 +57,7 @@ class Body:
 
 
 def draw_body(seed: int, index: int, family: str) -> Body:
-    """The body of a run; faultless runs have no unmodelled part, and a camera on the hand no bracket before it."""
+    """The body of a run. Faultless runs have no unmodelled part; with a camera on the hand, there is no bracket."""
     rng = np.random.default_rng([seed, index, 3])
     if seed < FIRST_OF_STEREO or rng.random() < PLAIN_SHARE:
         return Body()

@@ -1,7 +1,7 @@
-"""The exact clearance of the arm's true surface, between the samples of a motion too.
+"""The exact clearance of the arm's true surface, also between the samples of a motion.
 
-The arm is the capsules and blocks of its body, the scene is primitives; all are convex, so that the
-signed distance to a primitive is a convex function along a capsule's axis and over a block.
+The arm is the capsules and blocks of its body; the scene is primitives. All are convex. Thus the signed distance to a
+primitive is a convex function along a capsule's axis and over a block.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,9 +28,10 @@ Positions = Callable[[Stamps], Float64]
 
 
 class TrueArm:
-    """The surfaces of the moving links of the arm whose kinematics `urdf` has.
+    """The surfaces of the moving links of `model`'s arm.
 
-    tool: a further capsule on the hand, which no model knows of. body: how it looks, by default as it collides.
+    tool: a further capsule on the hand, which no model includes. body: visual shapes, by default the collision
+    shapes.
     """
 
     def __init__(self, model: RobotModel, tool: Capsule | None = None, body: Body | None = None) -> None:
@@ -59,8 +60,8 @@ class TrueArm:
         return self._marks.sphere_centers_batch(q)
 
     def clearances(self, primitives: Sequence[Primitive], stamps: Stamps, q: Float64) -> Float64:
-        """Signed distance (T,) [m] of the surface to what is present at each stamp; negative in contact (then no
-        deeper than the truth).
+        """Signed distance (T,) [m] of the surface from the primitives present at each stamp. It is negative in
+        contact, and then no deeper than the truth.
         """
         marks = self.marks(q)
         ends = marks[:, : 2 * self._num_capsules].reshape(len(q), self._num_capsules, 2, 3)
@@ -101,10 +102,10 @@ class TrueArm:
 def least_clearance(
     arm: TrueArm, primitives: Sequence[Primitive], positions: Positions, first_ns: int, last_ns: int
 ) -> tuple[float, int]:
-    """The least clearance [m] of a motion and when it is [ns]; intervals that could hide less are halved.
+    """The least clearance [m] of a motion and its time [ns]; intervals that may contain less are halved.
 
-    positions: joint positions (T, J) at stamps (T,). Between two samples nothing can come nearer by more than half of
-    how far the arm and the scene moved in between.
+    positions: joint positions (T, J) at stamps (T,). Between two samples, clearance is at least their mean minus half
+    of the distance that arm and scene moved.
     """
     knots = [knot for p in primitives if p.track is not None for knot in p.track.stamp_ns.tolist()]
     edges = [edge for p in primitives for edge in (p.from_ns, p.to_ns - 1)]
@@ -142,9 +143,7 @@ def _sampled(
 
 
 def _travel(moved: tuple[Float64, ...]) -> Float64:
-    """How far [m] arm and scene came towards each other at most between neighbouring samples (T - 1,), between which
-    solids go straight on.
-    """
+    """Largest approach (T - 1,) [m] of arm and scene between samples, for solids that move straight."""
     steps = [np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) for points in moved]
     return np.asarray(steps[0] + (np.max(steps[1:], axis=0) if len(steps) > 1 else 0.0))
 
@@ -152,8 +151,8 @@ def _travel(moved: tuple[Float64, ...]) -> Float64:
 def _of_block(primitive: Primitive, corners: Float64, block: Block, bound: Float64) -> Float64:
     """Least clearance (T,) of a block whose middle and axes are `corners` (T, 4, 3), in the primitive's frame.
 
-    By projecting in turns on the primitive and on the block, then, where they meet, down the signed distance by steps
-    that shrink.
+    Projects in turns on the primitive and on the block. If they meet, it descends the signed distance with shrinking
+    steps.
     """
     at_rest, half = _centred(primitive), np.array(block.size) / 2
     out = _signed(at_rest, corners[:, 0]) - float(half.min())

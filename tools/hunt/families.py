@@ -1,4 +1,4 @@
-"""The families of the hunt: what each puts before the arm, and what it spoils."""
+"""The families of the hunt: each one's target near the arm, and its faults."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -18,15 +18,15 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """One family's draw: the kind of the fault in words, its strength (the unit is the kind's own), the target.
+    """One family's draw: the kind of the fault, its strength in a unit of the kind, and the target.
 
-    second: when [s] the target is near the arm, None for any time; cameras: that are recorded; touches_first: the
-    target may be at the arm from the first moment on; people: names that masks show; only_audit: nothing to drive;
-    only_closed: always driven. distance: of the cameras, as a share of the usual; has_wrist: beside them one rides on
-    the hand; settings: of the configuration, by key. turn: of the motion, as a share of the usual. towards: from
-    where the target comes to the arm: the side that the cameras do not see (`behind`), the x axis, or any; from_link:
-    the share of the arm, from its base, that it does not come to. box_gap [m]: by how much the workspace ends before
-    the target. max_map_age [s]: that the user allows.
+    second: time [s] at which the target is near the arm, None for any. cameras: recorded cameras. touches_first: the
+    target may be at the arm from the start. people: names in masks. only_audit: never driven. only_closed: always
+    driven. distance: of the cameras, as a share of the usual. has_wrist: a further camera is on the hand. settings:
+    of the configuration, by key. turn: of the motion, as a share of the usual. towards: direction from which the
+    target nears the arm: the side that cameras do not see (`behind`), the x axis, or any. from_link: share of the
+    arm, from its base, that the target does not near. box_gap [m]: between the workspace's end and the target.
+    max_map_age [s]: allowed by the user.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Draft:
 
 
 def target(rng: np.random.Generator, size: float = 1.0) -> Make:
-    """A post or box on the table, as high as it takes, or a ball or box that hangs; `size` scales its width."""
+    """A post or box on the table, or a hanging ball or box; `size` scales its width."""
     kind = ("post", "box", "ball", "crate")[int(rng.integers(4))]
     width = size * rng.uniform(0.04, 0.10)
     above = float(rng.uniform(0.02, 0.12))
@@ -97,7 +97,7 @@ def thin(rng: np.random.Generator) -> Draft:
 
 
 def touch(rng: np.random.Generator) -> Draft:
-    """Things at the arm from the first moment on, in its hand, or just beside its way."""
+    """Objects at the arm from the start, in its hand, or just beside its path."""
     kind = ("resting", "carried", "close")[int(rng.integers(3))]
     if kind == "carried":
         length = float(rng.uniform(0.06, 0.25))
@@ -143,7 +143,7 @@ def visit(rng: np.random.Generator) -> Draft:
 
 
 def occlusion(rng: np.random.Generator) -> Draft:
-    """One or two cameras; the target is there from the first, or appears, where the arm may hide it."""
+    """One or two cameras; the arm may hide the target, which is there from the start or appears."""
     cameras = tuple(sorted(rng.choice(CAMERAS, size=1 if rng.random() < 0.7 else 2, replace=False).tolist()))
     base, appears = target(rng, 0.8), rng.random() < 0.5
     since = float(rng.uniform(0.6, 1.6)) if appears else None
@@ -156,7 +156,7 @@ def occlusion(rng: np.random.Generator) -> Draft:
 
 
 def holes(rng: np.random.Generator) -> Draft:
-    """Depth that is not there: dark or shiny targets, short range, wide edges."""
+    """Missing depth: dark or shiny targets, short range, wide edges."""
     kind = ("dark", "shiny", "far", "edges")[int(rng.integers(4))]
     make = target(rng)
     if kind in ("dark", "shiny"):
@@ -170,7 +170,7 @@ def holes(rng: np.random.Generator) -> Draft:
 
 
 def depth(rng: np.random.Generator) -> Draft:
-    """Depth of one camera or of all is scaled or shifted; sometimes only one camera is there."""
+    """Depth of one camera or of all is scaled or shifted; sometimes there is only one camera."""
     is_scale, share = rng.random() < 0.5, rng.random()
     recorded = (CAMERAS[int(rng.integers(3))],) if share > 0.7 else CAMERAS
     spoiled = recorded if share > 0.4 else (CAMERAS[int(rng.integers(3))],)
@@ -186,7 +186,7 @@ def depth(rng: np.random.Generator) -> Draft:
 
 
 def pose(rng: np.random.Generator) -> Draft:
-    """One camera, or all by the same, stands elsewhere than the log says: 1 mm to 5 cm, up to 2 degrees."""
+    """Logged poses of one camera, or of all alike, are wrong by 1 mm to 5 cm and up to 2 degrees."""
     share = rng.random()
     recorded = (CAMERAS[int(rng.integers(3))],) if share > 0.75 else CAMERAS
     spoiled = recorded if share > 0.5 else (CAMERAS[int(rng.integers(3))],)
@@ -245,7 +245,7 @@ def frames(rng: np.random.Generator) -> Draft:
 
 
 def robot(rng: np.random.Generator) -> Draft:
-    """A model of few or small spheres, or with a wrong link; a tool it lacks; joints that are not what they say."""
+    """A model of few or small spheres, with a wrong link or without a tool, or wrongly logged joints."""
     kind = ("few", "small", "longer", "tool", "swapped", "degrees", "offset")[int(rng.integers(7))]
     make = target(rng)
     if kind == "few":
@@ -275,7 +275,7 @@ def robot(rng: np.random.Generator) -> Draft:
 
 
 def unknown(rng: np.random.Generator) -> Draft:
-    """Cameras that look elsewhere: one or two, with a long focal length; the way leads through what none saw."""
+    """One or two cameras of long focal length that look elsewhere; the path leads through unseen space."""
     cameras = tuple(sorted(rng.choice(CAMERAS, size=1 if rng.random() < 0.6 else 2, replace=False).tolist()))
     zoom = float(rng.uniform(1.4, 3.0))
     return Draft(kind=f"{len(cameras)} cameras", strength=zoom, make=target(rng), cameras=cameras, zoom=zoom)
@@ -336,7 +336,7 @@ def settings(rng: np.random.Generator) -> Draft:
 
 
 def frozen(rng: np.random.Generator) -> Draft:
-    """Every camera's last image comes again with new stamps, or its depth does, while a thing comes to the arm."""
+    """Each camera's last image, or only its depth, repeats with new stamps while an object nears the arm."""
     first = int(rng.integers(3, NUM_FRAMES - 5))
     base, repeats_color = target(rng), rng.random() < 0.5
     since = first / 5.0 + float(rng.uniform(0.0, 0.3))
@@ -360,7 +360,7 @@ def too_far(rng: np.random.Generator) -> Draft:
 
 
 def small(rng: np.random.Generator) -> Draft:
-    """A motion of a few centimetres, one or two cameras, and a ball behind the arm where none of them sees."""
+    """A motion of a few centimetres, one or two cameras, and a ball behind the arm that none sees."""
     cameras = tuple(sorted(rng.choice(CAMERAS, size=1 + int(rng.random() < 0.4), replace=False).tolist()))
     radius = float(rng.uniform(0.02, 0.04))
     solid = floating("target", "sphere", (radius,), np.zeros(3), rng)
@@ -372,7 +372,7 @@ def small(rng: np.random.Generator) -> Draft:
 
 
 def box(rng: np.random.Generator) -> Draft:
-    """The workspace ends a little before a plate that all cameras show."""
+    """The workspace ends just before a plate that all cameras show."""
     size = (float(rng.uniform(0.01, 0.03)), float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.25, 0.5)))
     solid = floating("target", "box", size, np.zeros(3), rng, UP)
 
@@ -392,7 +392,7 @@ def waiver(rng: np.random.Generator) -> Draft:
 
 
 def dark(rng: np.random.Generator) -> Draft:
-    """A target that returns no depth to any camera, beside any part of the arm, which may rest."""
+    """A target next to any part of the arm that returns no depth to any camera; the arm may rest."""
     cameras = CAMERAS if rng.random() < 0.5 else tuple(sorted(rng.choice(CAMERAS, size=2, replace=False).tolist()))
     return Draft(
         kind=f"{len(cameras)} cameras", strength=1.0, make=target(rng), fault=Fault(dark=1.0), cameras=cameras,

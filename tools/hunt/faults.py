@@ -1,4 +1,4 @@
-"""What goes wrong in a run beside what truly stands there: sensors, clocks, logs, the robot's model, the settings."""
+"""The faults of a run: in sensors, clocks, logs, the robot's model and the settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,16 +14,16 @@ NUM_JOINTS = len(JOINTS)
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """Every way to lie, none of them by default. By camera name: depth_scale and depth_bias [m] of what it measures;
-    pose (6,) by how much its recorded pose is off [m, rad]; clock [s] by how much its stamps are late.
+    """All faults, none by default. By camera name: depth_scale and depth_bias [m] of its depth; pose (6,) [m, rad],
+    the error of its recorded pose; clock [s], the delay of its stamps.
 
-    lost, blind: (camera, frame) whose images are missing, or hold no depth; lost_states: from, to [s] without joint
-    states; dark: share of the target's pixels without depth; speckle: that share is lost pixel by pixel; max_range
-    [m] of the depth camera; edge [m]: steps of depth beside which edge_share of the pixels are lost; latency [s] of
-    the map; order, offset [rad], in_degrees: how joint positions are logged. spheres_kept, spheres_shrunk [m],
-    longer: joint and by how much [m] the model's link differs; max_splats. repeated: the frame from which on every
-    camera's last image comes again, its depth alone or its colour too (repeats_color); beyond [m]: how far behind its
-    place the target is measured; instead [m]: the depth that is written for none on it.
+    lost: (camera, frame) without images. blind: (camera, frame) without depth. lost_states: from, to [s] without
+    joint states. dark: share of the target's pixels without depth. speckle: these pixels are scattered, not in blobs.
+    max_range [m] of the depth camera. edge [m]: steps of depth next to which edge_share of the pixels are lost.
+    latency [s] of the map. order, offset [rad], in_degrees: of logged joint positions. spheres_kept: share of the
+    model's spheres. spheres_shrunk [m]. longer: joint, and error [m] of the model's link. max_splats. repeated: frame
+    from which every camera's last depth repeats, and its colour, too (repeats_color). beyond [m]: error of the
+    target's depth. instead [m]: depth written for missing depth on the target.
     """
 
     depth_scale: Mapping[str, float] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Whether a recording holds the evidence that something is wrong, by stated rules, before the tool looks at it.
+"""Rules for whether a recording contains evidence of a fault, applied before the tool reads it.
 
 1. Depth and poses of a camera: its images show the arm, or another camera that is not wrong in the same way sees the
    same surface.
@@ -46,8 +46,8 @@ class Observable:
 def observable(
     draft: Draft, world: World, shown: Shown, *, frame_clearance: np.ndarray, least_ns: int, is_audit: bool
 ) -> Observable:
-    """By the rules above. frame_clearance (F,) [m]: of arm to target when the images were taken; least_ns: when the
-    recorded motion was nearest.
+    """Observability by the module's rules. frame_clearance (F,) [m]: between arm and target when the images were
+    taken; least_ns: time when the recorded motion was nearest.
     """
     fault = _of_fault(draft, world, shown)
     if not fault.holds:
@@ -78,7 +78,7 @@ def _of_fault(draft: Draft, world: World, shown: Shown) -> Observable:
 
 
 def _sees_arm(shown: Shown, rows: list[int], frames: np.ndarray) -> bool:
-    """Whether the cameras show the arm in three images of these frame sets."""
+    """True if the cameras show the arm in three images of these frame sets."""
     return bool(np.count_nonzero(shown.arm[rows][:, frames] >= NUM_ARM_PIXELS) >= 3)
 
 
@@ -130,7 +130,7 @@ def _pixel(world: World) -> float:
 
 
 def _at_its_place_since(target: Primitive, stamp_ns: int) -> int:
-    """Since when [ns] the target stands where it is at a stamp; the stamp itself while it moves."""
+    """Time [ns] since which the target stands at its place of `stamp_ns`; `stamp_ns` while it moves."""
     if target.track is None:
         return target.from_ns
     knots = [int(knot) for knot in target.track.stamp_ns if knot <= stamp_ns]

@@ -14,8 +14,8 @@ LONGEST = 90  # characters of a reason
 
 @dataclass(frozen=True, kw_only=True)
 class Word:
-    """One of `WORDS`. reason: the first one, its criterion, then a colon and a sentence. only: the limit of evidence
-    that alone keeps the run from being safe, empty without one.
+    """One of `WORDS`. reason: the first reason's criterion, a colon and its sentence. only: the only limit of
+    evidence that prevents safe, or "".
     """
 
     word: str
@@ -24,8 +24,8 @@ class Word:
 
 
 def word_of(verdict: Verdict, trace: Trace, margin: float) -> Word:
-    """A failure other than contact is `failed`, what passed by a waiver `waived`. trace: with what was known
-    about the arm, within a margin [m].
+    """A failure other than contact is `failed`; a pass by a waiver is `waived`. trace: with evidence within `margin`
+    [m] of the arm.
     """
     broken = [limit.name for limit in LIMITS if limit.is_broken(trace, margin)]
     only = broken[0] if len(broken) == 1 == len(verdict.decisive) else ""

@@ -1,4 +1,4 @@
-"""What the cameras and joints of a run record, faults included, as a log; and what of it shows arm and target."""
+"""A run's recording by cameras and joints, with its faults, and its pixels of arm and target."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -31,10 +31,10 @@ SAME_SURFACE = 0.02  # [m] two cameras see the same place
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """Pixels (C, F) with depth, as recorded, of the arm, of the target and in all; `target_outline` with or without
-    it; `target_hole`, of its outline where that has depth of other things all around; 0 where the image is missing.
-    overlap (C, C): pixels of one camera's first image that another one sees, too; stamps (F,) [ns] when the images
-    were truly taken.
+    """Pixels (C, F) with depth, as recorded, of the arm, of the target and in all. `target_outline`: the target's
+    pixels with or without depth. `target_hole`: outline pixels, if depth of other objects surrounds the outline. All
+    are 0 if the image is missing. overlap (C, C): pixels of one camera's first image that another camera sees, too.
+    stamps (F,) [ns]: true times of the images.
     """
 
     cameras: tuple[str, ...]
@@ -96,7 +96,7 @@ class Recorder:
                     yield self._frame(number, renderer, index, arm, targets)
 
     def _renderers_at(self, stamp_ns: int) -> list[Renderer]:
-        """Of the cameras that stand, and of that on the hand where it is at a stamp."""
+        """Renderers of the stationary cameras, and of the camera on the hand at its pose of a stamp."""
         wrist = self._world.wrist
         if wrist is None:
             return self._renderers
@@ -228,7 +228,7 @@ def _nearer(depth: Float32, without: Float32) -> np.ndarray:
 
 
 def _is_enclosed(inner: np.ndarray, around: np.ndarray) -> bool:
-    """Whether pixels (H, W) are inside of the image, and most of what is within `RING` of them is `around`."""
+    """True if pixels `inner` (H, W) avoid the image border, and most pixels within `RING` of them are `around`."""
     if not inner.any() or inner[[0, -1]].any() or inner[:, [0, -1]].any():
         return False
     ring = cv2.dilate(inner.astype(np.uint8), np.ones((2 * RING + 1, 2 * RING + 1), np.uint8)).astype(bool) & ~inner
@@ -236,7 +236,7 @@ def _is_enclosed(inner: np.ndarray, around: np.ndarray) -> bool:
 
 
 def _lost(fault: Fault, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Which pixels (H, W) a dark or shiny surface loses: speckled, or in blobs."""
+    """Pixels (H, W) that a dark or shiny surface loses: speckled, or in blobs."""
     if fault.dark == 0:
         return np.zeros(shape, dtype=bool)
     if fault.speckle:

@@ -31,7 +31,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def merge_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Put runs into a table, in the place of the same ones of before."""
+    """Put runs into a table; they replace earlier rows of the same runs."""
     merged = {(row.seed, row.index): row for row in (*read_rows(path), *rows)}
 
     def write(place: Path) -> None:
@@ -68,7 +68,7 @@ def report(rows: Sequence[Row]) -> list[str]:
 
 
 def border_of(rows: Sequence[Row]) -> list[Row]:
-    """The runs nearest to the border: half of them safe with the least true clearance, half truly broken by least."""
+    """The runs nearest to the border: half are safe with the least true clearance, half break the margin by least."""
     mine = [row for row in rows if row.observable and row.outcome != "crash" and not row.is_false_green]
     safe = sorted((row for row in mine if row.outcome == "safe"), key=lambda row: row.clearance)
     limit = MARGIN - TOLERATED
@@ -109,7 +109,7 @@ def _benign(rows: Sequence[Row]) -> list[str]:
 
 
 def _why(rows: Sequence[Row]) -> list[str]:
-    """By which criterion runs that are truly clear are not safe, all families."""
+    """Criteria by which truly clear runs of all families are not safe."""
     reasons = Counter(_criterion(row) for row in rows if truth_of(row) == "clear" and row.outcome != "safe")
     return [
         "truly clear and not safe, by criterion:",
@@ -118,7 +118,7 @@ def _why(rows: Sequence[Row]) -> list[str]:
 
 
 def _limits(rows: Sequence[Row]) -> list[str]:
-    """For each limit of evidence, how many runs it alone keeps from being safe, by their truth."""
+    """Numbers of runs by truth that only one limit of evidence keeps from being safe, by limit."""
     lines = [f"{'safe without':20s} " + " ".join(f"{truth:>8s}" for truth in TRUTHS)]
     for limit in LIMITS:
         there = Counter(truth_of(row) for row in rows if row.only == limit.name)

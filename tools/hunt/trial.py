@@ -1,4 +1,4 @@
-"""One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict put beside the truth."""
+"""One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict compared with the truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ OTHER_SHARES = (0.62, 0.16)
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One run before it is run. seed: of the campaign; index: within it."""
+    """One planned run. seed: of the campaign; index: within the campaign."""
 
     seed: int
     index: int
@@ -66,10 +66,10 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What came of one run: the verdict, its first reason, and the truth [m].
+    """Result of one run: the verdict, its first reason, and the truth [m].
 
-    robot: the words of its body; spread, fattening [px]: of its stereo depth, 0 where depth is nearly exact. only:
-    the limit of evidence that alone keeps it from being safe.
+    robot: its body in words; spread, fattening [px]: of its stereo depth, 0 for nearly exact depth. only: the only
+    limit of evidence that prevents safe.
     """
 
     seed: int
@@ -152,7 +152,7 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
 
 
 def run(seed: int, index: int, device: str = "cpu") -> Row:
-    """Draw, record, judge, compare; the fit on a `device`, as of --device."""
+    """Draw, record, judge and compare a run; fit its map on `device`."""
     with TemporaryDirectory(prefix="hunt") as name:
         folder = Path(name)
         model = true_robot(folder)
@@ -191,7 +191,7 @@ def true_robot(folder: Path) -> RobotModel:
 
 
 def record(trial: Trial, model: RobotModel, folder: Path) -> Shown:
-    """Write what the tool is given: log.mcap, robot.urdf, robot.yaml."""
+    """Write the tool's inputs: log.mcap, robot.urdf, robot.yaml."""
     fault, rng = trial.draft.fault, np.random.default_rng([trial.seed, trial.index, 1])
     (folder / "robot.urdf").write_text(fault.urdf(trial.world.body.shapes), encoding="utf-8")
     (folder / "robot.yaml").write_text(spheres_yaml(fault.spheres(rng)), encoding="utf-8")
@@ -200,7 +200,7 @@ def record(trial: Trial, model: RobotModel, folder: Path) -> Shown:
 
 
 def config_of(trial: Trial) -> Config:
-    """The defaults, with fewer iterations than a person would use, for the small images of these runs."""
+    """The defaults, with fewer iterations, because the images are small."""
     config = Config()
     splats = trial.draft.fault.max_splats or SPLATS
     scene = replace(
@@ -259,8 +259,8 @@ def _judged(trial: Trial, folder: Path, device: str = "cpu") -> tuple[Word, Repl
 
 
 def _true_clearance(trial: Trial, arm: TrueArm, result: ReplayResult | None) -> float:
-    """The least clearance [m] over the judged motion: of an audit from the first judged state to the log's end, of a
-    closed loop over what it drove; over the recorded motion where nothing was judged.
+    """The least clearance [m] over the judged motion. An audit's begins at the first judged state and ends with the
+    log; a closed loop's is the driven motion. If nothing was judged, it is the recorded motion.
     """
     first, last = at_s(0.0), at_s(DURATION_S)
     positions: Positions = trial.world.positions
@@ -317,7 +317,7 @@ def _carried(draft: Draft, motion: Motion, model: RobotModel, palm: float) -> Pr
 
 
 def _seen_from(camera: Camera, draft: Draft) -> Camera:
-    """The camera with the draft's lens, as far back along its axis as it says; it looks at a place a metre away."""
+    """The camera with the draft's lens, moved back along its axis by `distance` - 1 [m]."""
     k, T = camera.intrinsics, camera.T_world_camera.copy()
     T[:3, 3] -= (draft.distance - 1.0) * T[:3, 2]
     zoom = draft.zoom

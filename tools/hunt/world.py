@@ -1,4 +1,4 @@
-"""What is truly there: a table with things on it, the arm's motion, and one target placed at a chosen clearance."""
+"""The true scene: a table with objects on it, the arm's motion, and one target at a chosen clearance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,10 +40,10 @@ Make = Callable[[Float64], Made]  # the target's solids with its middle at (3,) 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """The truth of one run: `things` stand from beginning to end, `targets` are what the family is about.
+    """The truth of one run: `things` stand throughout; `targets` are the family's objects.
 
-    wrist: a camera on the hand, its pose that in the hand's frame. tool: a capsule on the true arm's hand that no
-    model has. body: how the arm looks and is measured. people: names of the targets that masks show.
+    wrist: a camera on the hand, with T_hand_camera as its pose. tool: a capsule on the true arm's hand that no model
+    has. body: the arm's visual shapes and depth. people: names of the targets in masks.
     """
 
     motion: Motion
@@ -88,8 +88,8 @@ def table() -> Primitive:
 def draw_motion(
     rng: np.random.Generator, model: RobotModel, arm: TrueArm, cameras: Sequence[Camera], turn: Float64 = TURN
 ) -> Motion:
-    """One stroke, at rest at first and at the end, that keeps off the table, itself, the limits and the borders, the
-    hand in view of two cameras; turn (7,) [rad]: from start to end at most.
+    """One stroke between two rests, clear of the table, the arm itself, limits and borders, with the hand in view of
+    two cameras. turn (7,) [rad]: at most from start to end.
     """
     least = 0.5 * float(np.linalg.norm(turn) / np.linalg.norm(TURN))
     pairs, radii = model.self_pairs(), model.sphere_set.radii
@@ -114,7 +114,7 @@ def draw_motion(
 
 
 def draw_cameras(rng: np.random.Generator, width: int = WIDTH) -> tuple[Camera, ...]:
-    """Three cameras about the table, none where another draw has it; width [px] of their images."""
+    """Three cameras about the table at random places; width [px] of their images."""
     focal, height = 1.0 * width, 3 * width // 4
     k = Intrinsics(
         fx=focal, fy=focal, cx=(width - 1) / 2 + 0.7, cy=(height - 1) / 2 - 0.6, width=width, height=height
@@ -135,7 +135,7 @@ def draw_cameras(rng: np.random.Generator, width: int = WIDTH) -> tuple[Camera, 
 
 
 def wrist_camera(width: int = WIDTH) -> Camera:
-    """Beside the hand, looking past the fingers; T_world_camera is T_hand_camera."""
+    """A camera next to the hand, looking past the fingers; its T_world_camera is T_hand_camera."""
     height = 3 * width // 4
     k = Intrinsics(
         fx=0.8 * width, fy=0.8 * width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height
@@ -222,11 +222,10 @@ def placed(
     towards: Float64 | None = None,
     from_link: float = 0.5,
 ) -> Made | None:
-    """The target where the arm's least clearance to it is `clearance` [m], near the arm at a time [s], in the view
-    of two cameras or of all; None where no such place was found.
+    """The target at `clearance` [m] from the recorded arm, in view of two cameras or all; None without such a place.
 
-    It is drawn towards a point of the arm from half a metre beside it, by bisection; from `towards` (3,), a point or
-    where there is none anywhere beside. from_link: the share of the arm, from its base, that is no such point.
+    Bisection moves the target towards a point of the arm at time `second` [s], from a horizontal direction or from
+    the point `towards` (3,). from_link: share of the arm, from its base, that is never that point.
     """
     stamps = samples()
     q = positions_of(motion, stamps)
@@ -254,14 +253,14 @@ def placed(
 
 
 def _is_in_reach(place: Float64, cameras: Sequence[Camera]) -> bool:
-    """Whether a place is in the workspace, in view, and not on the arm's base."""
+    """True if a place is in the workspace, in view, and not on the arm's base."""
     if not BOX.contains(place) or np.linalg.norm(place[:2]) < 0.2 or place[0] < -0.1:
         return False
     return sum(_shows(camera, place) for camera in cameras) >= min(2, len(cameras))
 
 
 def _shows(camera: Camera, place: Float64) -> bool:
-    """Whether a point (3,) is before a camera, three pixels from the image's border."""
+    """True if a point (3,) is before a camera, at least three pixels inside its image."""
     point = transform_points(invert_transform(camera.T_world_camera), place[None])[0]
     pixel = project(camera.intrinsics, point)
     inside = np.all((pixel > 3) & (pixel < [camera.intrinsics.width - 4, camera.intrinsics.height - 4]))

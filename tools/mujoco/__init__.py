@@ -1,1 +1,1 @@
-"""An independent judge: recordings made by MuJoCo, with exact truth, and what `splatctrl` says of them."""
+"""An independent judge: recordings made by MuJoCo, with exact truth, and the answers of `splatctrl`."""

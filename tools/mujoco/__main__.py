@@ -1,4 +1,4 @@
-"""Recordings by MuJoCo and what the tool says of them: ``python -m tools.mujoco record | campaign | facade``."""
+"""Recordings by MuJoCo and the tool's answers: ``python -m tools.mujoco record | campaign | facade``."""
 
 import argparse
 import os

@@ -1,7 +1,7 @@
 """Judge the tool by recordings with exact truth: ``python -m tools.mujoco campaign --runs 100 --seed 0``.
 
-The recordings are made where they are missing, ``splatctrl batch`` runs on them, and a table compares the answers
-with the truth. The same line continues after an interruption.
+Missing recordings are made, ``splatctrl batch`` runs on all, and a table compares the answers with the truth. The
+same command line continues after an interruption.
 """
 
 import argparse
@@ -46,7 +46,8 @@ class Request:
 class Machinery:
     """The recorder, the truth of driven motions, and the tool under test.
 
-    fit_spheres: for a URDF into a file, why it failed; run_batch: nodes by RECORDING/JOB of a suite's file.
+    fit_spheres: writes a URDF's spheres to a file, and returns why it failed. run_batch: runs a suite's file, and
+    returns nodes by RECORDING/JOB.
     """
 
     record: Record
@@ -56,7 +57,7 @@ class Machinery:
 
 
 def campaign(arguments: Sequence[str]) -> int:
-    """Judge, and print the report; 1 where something truly in contact was called safe."""
+    """Judge, and print the report; return 1 if a run truly in contact was called safe."""
     args = _make_parser().parse_args(arguments)
     if args.report:
         rows = list[Row]()
@@ -108,7 +109,7 @@ def choose_indices(first: int, runs: int, shard: tuple[int, int]) -> range:
 
 
 def make_recordings(request: Request, record: Record) -> dict[int, str]:
-    """Make the recordings that are missing or by other sources, and return why any failed, by index."""
+    """Make recordings that are missing or of other sources; return reasons of failures by index."""
     digest = hash_sources(HERE)
     missing = [index for index in request.indices if _read_stamp(_place(request, index)) != digest]
     return _record_all(request, missing, record, digest)
@@ -137,13 +138,13 @@ def write_suite(recordings: Sequence[Recording], *, num_threads: int | None) -> 
 
 
 def find_tool() -> list[str]:
-    """The command line of the tool under test: beside this Python, else its package."""
+    """The command line of the tool under test: next to this Python, else its package."""
     executable = Path(sys.executable).with_name("splatctrl")
     return [str(executable)] if executable.is_file() else [sys.executable, "-m", "splatctrl_cli"]
 
 
 def fit_spheres(urdf: Path, spheres: Path) -> str:
-    """Fit a robot's spheres by the tool as a process; why it wrote none, empty where it did."""
+    """Fit a robot's spheres in a process of the tool; return why it failed, or ""."""
     spheres.parent.mkdir(parents=True, exist_ok=True)
     words = [*find_tool(), "robot", "spheres", "--urdf", str(urdf), "-o", str(spheres), "--force", "-q"]
     ended = subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
@@ -151,7 +152,7 @@ def fit_spheres(urdf: Path, spheres: Path) -> str:
 
 
 def run_batch(suite: Path, workers: int) -> dict[str, Node]:
-    """Run a suite by the tool as a process, and return how each node ended. Raises RuntimeError without an answer."""
+    """Run a suite in a process of the tool, and return how each node ended. Raises RuntimeError without an answer."""
     words = [*find_tool(), "batch", str(suite), "--workers", str(workers), "--json"]
     ended = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)
     document = json.loads(ended.stdout or "{}")
@@ -162,7 +163,7 @@ def run_batch(suite: Path, workers: int) -> dict[str, Node]:
 
 
 def record_one(record: Record, seed: int, index: int, folder: Path, digest: str) -> str:
-    """Make a recording from nothing and stamp it; returns why it failed, empty where it did not."""
+    """Make a new recording and stamp it; return why it failed, or ""."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     try:
@@ -175,7 +176,9 @@ def record_one(record: Record, seed: int, index: int, folder: Path, digest: str)
 
 
 def _record_all(request: Request, indices: Sequence[int], record: Record, digest: str) -> dict[int, str]:
-    """As `make_recordings`. Where a process dies, each recording without an answer gets one of its own."""
+    """Make recordings in parallel; return reasons of failures by index. If a process dies, each unanswered recording
+    gets its own process.
+    """
     failures, lost = dict[int, str](), list[int]()
     with ProcessPoolExecutor(request.jobs, mp_context=get_context("spawn")) as pool:
         futures = {

@@ -1,4 +1,4 @@
-"""A robot cell as a MuJoCo model: links with what is seen and what collides, solids, lights, cameras."""
+"""A robot cell as a MuJoCo model: links' visual and collision meshes, solids, lights, cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Lens:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One imager: its optical frame (4, 4) in the world, or in a link's frame where it rides on one."""
+    """One imager: its optical frame (4, 4) in the world, or in the frame of its `link`."""
 
     name: str
     lens: Lens
@@ -80,7 +80,7 @@ class Cell:
         self._bodies = [self.model.body(link).id for link in self.links]
 
     def place(self, q: Float64, time: float) -> None:
-        """Put the driven joints (J,) and every solid where they are at a time [s]."""
+        """Move the driven joints to `q` (J,) and every solid to its place at a time [s]."""
         for joint, value in zip(self.robot.driven, q, strict=True):
             self.data.qpos[self._qpos[joint.name]] = value
         for solid in self.solids:
@@ -189,7 +189,7 @@ def lathe_mesh(profile: Float64) -> trimesh.Trimesh:
 
 
 def as_piece(solid: Solid) -> Piece:
-    """A solid's surface as triangles in its own frame, for what moves with the robot."""
+    """A solid's surface as triangles in its own frame, for solids that move with the robot."""
     make = {
         "box": lambda: trimesh.creation.box(2 * np.array(solid.size)),
         "cylinder": lambda: trimesh.creation.cylinder(solid.size[0], 2 * solid.size[1], sections=SECTIONS),
@@ -217,7 +217,7 @@ def _add_mesh(spec: mujoco.MjSpec, name: str, vertices: Float64, faces: NDArray[
 
 
 def _add_box(spec: mujoco.MjSpec, solid: Solid) -> None:
-    """A box as a mesh whose texture has the same scale on all six sides, which MuJoCo's own boxes do not have."""
+    """Add a box as a mesh with one texture scale on all six sides, unlike MuJoCo's boxes."""
     corners: list[Float64] = []
     marks: list[list[float]] = []
     faces: list[list[int]] = []

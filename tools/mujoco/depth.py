@@ -1,6 +1,6 @@
-"""What a depth camera makes of exact depth: active stereo in the manner of a D435, a scanned laser as in an L515.
+"""Depth cameras' errors on exact depth: active stereo like a D435, a scanned laser like an L515.
 
-Published figures beside those used here are in docs/reliability.md.
+docs/reliability.md compares published figures with the figures used here.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Stereo:
     far: float = 6.0  # [m]
 
     def measured(self, depth: Float64, lost: NDArray[np.bool_], rng: np.random.Generator) -> Float64:
-        """Depth (H, W) [m] of exact depth, 0 where none is returned; lost: pixels whose surface returns nothing."""
+        """Measured depth (H, W) [m] of exact depth, 0 if missing; lost: pixels whose surface returns none."""
         there = depth > 0
         scale = DEPTH_LENS.fx * self.baseline
         disparity = np.where(there, scale / np.where(there, depth, 1.0), 0.0)
@@ -70,7 +70,7 @@ class Laser:
 
 
 def draw_sensor(kind: str, rng: np.random.Generator) -> Stereo | Laser | None:
-    """The sensor of a kind of `DEPTHS`, its strength drawn; None for exact depth."""
+    """The sensor of a kind of `DEPTHS`, with random strength; None for exact depth."""
     if kind == "ideal":
         return None
     if kind == "laser":
@@ -84,9 +84,10 @@ DEPTHS = ("ideal", "mild", "real", "laser")
 
 
 def aligned(depth: Float64, color_lens: Lens) -> NDArray[np.uint16]:
-    """A depth imager's image (H, W) [m] as the colour camera (H, W) would have it, in `COUNT`.
+    """A depth image (H, W) [m] resampled to the colour camera (H, W), in units of `COUNT`.
 
-    As librealsense aligns: each pixel's square is projected by its corners and fills whole pixels; the nearest stays.
+    Aligns as librealsense does: each pixel's square is projected by its corners and fills whole pixels; the nearest
+    depth wins.
     """
     v, u = np.nonzero(depth > 0)
     z = depth[v, u]
@@ -117,14 +118,14 @@ def counted(depth: Float64) -> NDArray[np.uint16]:
 
 
 def _shadow(disparity: Float64) -> NDArray[np.bool_]:
-    """True where the right imager has something nearer before what a pixel of the left one shows."""
+    """True where a nearer surface hides a left pixel's surface from the right imager."""
     there = np.arange(disparity.shape[1]) - disparity
     nearest = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     return np.asarray(there > nearest + 0.5)
 
 
 def _fattened(disparity: Float64, most: int, rng: np.random.Generator) -> Float64:
-    """Disparity with each foreground grown over what lies behind it by 1 to `most` pixels, by place."""
+    """Disparity with foregrounds grown over their background by 1 to `most` pixels, depending on place."""
     if most == 0:
         return disparity
     field = _smooth(disparity.shape, 6.0, rng)

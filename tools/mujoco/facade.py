@@ -1,6 +1,7 @@
 """`python -m tools.mujoco facade OUT`: photographs of a facade at 6 to 9 m, exact poses, depth by stereo matching.
 
-MuJoCo draws; OpenCV matches each view with one to its right. Every eighth view is held out, with exact depth.
+MuJoCo renders; OpenCV matches each view with a second view to its right. Every eighth view is held out, with exact
+depth.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def main(words: Sequence[str]) -> int:
 def write_views(out: Path, seed: int, baseline: float = 1.2, finer: int = 2) -> None:
     """Write images, poses and `facade.toml`, which describes them.
 
-    baseline [m]: between matched views; finer: pixels along one, at which they are matched.
+    baseline [m]: between matched views. finer: matching's pixels per image pixel, in each direction.
     """
     out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
@@ -133,7 +134,7 @@ def build_facade(rng: np.random.Generator) -> mujoco.MjModel:
 
 
 def choose_poses(rng: np.random.Generator) -> Iterator[Float64]:
-    """T_world_camera (4, 4) along the street, two heights by turns, towards the facade."""
+    """T_world_camera (4, 4) along the street, at two heights in turn, towards the facade."""
     for k in range(NUM_VIEWS):
         x = 8.0 * (k // 2) / (NUM_VIEWS // 2 - 1) - 4.0 + rng.uniform(-0.3, 0.3)
         height = rng.uniform(2.6, 3.4) if k % 2 == 0 else rng.uniform(1.4, 1.9)
@@ -177,7 +178,7 @@ def add_noise(color: UInt8, rng: np.random.Generator) -> UInt8:
 
 
 def match(left: UInt8, right: UInt8, baseline: float, finer: int) -> Float32:
-    """Depth (H, W) [m] of the left image by semi-global matching; 0 without texture, or where matches disagree."""
+    """Depth (H, W) [m] of the left image by semi-global matching; 0 without texture, or if matches disagree."""
     num_disparities = 16 * math.ceil(finer * FOCAL * baseline / NEAREST / 16)
     matcher = cv2.StereoSGBM.create(0, num_disparities, 5, 8 * 75, 32 * 75, 1, 0, 15, 100, 2, cv2.STEREO_SGBM_MODE_HH)
     gray, other = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))

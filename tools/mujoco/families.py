@@ -1,4 +1,4 @@
-"""The families of recordings: what each puts before the robot, and what it does to the cameras."""
+"""The families of recordings: each one's objects near the robot, and its camera faults."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ SKIN = (0.80, 0.62, 0.52)
 
 @dataclass(frozen=True, kw_only=True)
 class Family:
-    """draw: fills a stage; is_at_rest: the robot does not move; share: of a campaign."""
+    """Kind of recording. draw: fills a stage; is_at_rest: the robot does not move; share: of a campaign."""
 
     draw: Callable[[Stage], None]
     is_at_rest: bool = False
@@ -50,7 +50,7 @@ def contact(stage: Stage) -> None:
 
 
 def shelf(stage: Stage) -> None:
-    """Into a shelf: boards above and below the tip, a back, and sometimes sides."""
+    """The robot reaches into a shelf: boards above and below the tip, a back, sometimes sides."""
     rng = stage.rng
     tip = stage.tip(DURATION_S)[:3, 3]
     gap, wide = float(rng.uniform(0.16, 0.24)), float(rng.uniform(0.26, 0.34))
@@ -161,7 +161,7 @@ def person(stage: Stage) -> None:
 
 
 def carried(stage: Stage) -> None:
-    """A box or can in the hand from the first moment on, past a thing."""
+    """The robot carries a box or can past an object from the start."""
     rng = stage.rng
     half = float(rng.uniform(0.03, 0.08))
     kind, size = ("box", (0.025, 0.03, half)) if rng.random() < 0.5 else ("cylinder", (0.028, half))
@@ -172,7 +172,7 @@ def carried(stage: Stage) -> None:
 
 
 def tool(stage: Stage) -> None:
-    """A tool at the tip, or a cable along an arm, that the URDF does not have; past a thing."""
+    """The robot passes an object with a tool at its tip, or a cable, that the URDF lacks."""
     rng, tip = stage.rng, stage.robot.description.tip
     if rng.random() < 0.5:
         size = (float(rng.uniform(0.012, 0.03)), float(rng.uniform(0.03, 0.07)))
@@ -186,20 +186,20 @@ def tool(stage: Stage) -> None:
 
 
 def beyond_tip(robot: Robot, further: float) -> Float64:
-    """T_tip_thing (4, 4) of a thing `further` [m] than the tip reaches, its z axis along the tip's own."""
+    """T_tip_thing (4, 4) of an object `further` [m] beyond the tip, with its z axis along the tip's."""
     out = np.array(robot.description.out)
     return pose((robot.description.reach + further) * out, turn_along(out))
 
 
 def dark(stage: Stage) -> None:
-    """A thing that returns depth on a part of its surface, or none."""
+    """An object that returns depth on part of its surface, or none."""
     rng = stage.rng
     share, base = float(rng.uniform(0.4, 1.0)), _thing(stage)
     stage.put(lambda place: [replace(s, lost=share, rgb=(0.05, 0.05, 0.06)) for s in base(place)], wanted(rng))
 
 
 def wrist(stage: Stage) -> None:
-    """A camera on the hand, beside one or two that stand; a thing near."""
+    """A camera on the hand, with one or two stationary cameras; an object near."""
     rng, tip = stage.rng, stage.robot.description.tip
     names = rng.choice(["camera_left", "camera_right"], int(rng.integers(1, 3)), replace=False)
     stage.use_cameras(names.tolist())
@@ -219,7 +219,7 @@ def few(stage: Stage) -> None:
 
 
 def calibration(stage: Stage) -> None:
-    """One camera, or all, stand 1 to 15 mm and up to half a degree elsewhere than the log says."""
+    """Logged poses of one camera, or of all, are wrong by 1 to 15 mm and up to half a degree."""
     rng = stage.rng
     stage.put(_thing(stage), wanted(rng))
     wrong = [camera.name for camera in stage.cameras]
@@ -233,14 +233,14 @@ def calibration(stage: Stage) -> None:
 
 
 def phases(stage: Stage) -> None:
-    """Cameras that take their images one after the other, not together; a thing arrives."""
+    """Cameras take their images one after the other; an object arrives."""
     rng = stage.rng
     stage.cameras = [replace(camera, phase=float(rng.uniform(0.0, 0.09))) for camera in stage.cameras]
     arrive(stage)
 
 
 def grasp(stage: Stage) -> None:
-    """A thing stands in the open hand's way and goes with the hand from a time on."""
+    """An object stands in the open hand's way, and later moves with the hand."""
     since = float(stage.rng.uniform(0.3, 0.5))
     times = np.arange(0.0, DURATION_S + 0.01, 0.02)
     offset = beyond_tip(stage.robot, 0.03)
@@ -290,7 +290,7 @@ def _heading(rng: np.random.Generator) -> Float64:
 
 
 def _look_along(eye: Float64, target: Float64) -> Float64:
-    """T_link_camera of an eye in a link's frame, whose x axis need not be level."""
+    """T_link_camera (4, 4) at `eye` (3,), looking at `target` (3,); its x axis need not be level."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [1.0, 0.0, 0.0])
     x /= np.linalg.norm(x)

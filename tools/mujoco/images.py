@@ -1,4 +1,4 @@
-"""Images of a cell as its cameras take them: colour, depth as its sensor measures it, and what of them is robot."""
+"""Images of a cell's cameras: colour, depth as the sensor measures it, and the robot's pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ COLOR_NOISE = 2.0  # standard deviation of a channel, of 255
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """An RGB-D camera: its colour lens and optical frame (4, 4) in the world or in a link's frame; when after each
-    frame's time it takes its image [s].
+    """An RGB-D camera: its colour lens and optical frame (4, 4) in the world or in a link's frame. phase [s]: delay
+    of its images after each frame's time.
     """
 
     name: str
@@ -96,7 +96,7 @@ class Studio:
         return np.where(z < 8.5, z, 0.0)
 
     def _lost_pixels(self, geoms: NDArray[np.generic], rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Pixels of dark or shiny solids that return nothing, in blobs of six pixels."""
+        """Pixels (H, W) of dark or shiny solids that return no depth, in blobs of six pixels."""
         out = np.zeros(geoms.shape, dtype=bool)
         for geom, share in self._lost.items():
             coarse = rng.random((geoms.shape[0] // 6 + 1, geoms.shape[1] // 6 + 1)) < share

@@ -1,4 +1,4 @@
-"""The tool's answers about a recording beside the recording's truth."""
+"""The tool's answers about a recording, compared with the recording's truth."""
 
 import csv
 import json
@@ -49,7 +49,7 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """A command of a batch, and how it ended. exit_code: None where it was killed or never ran."""
+    """A command of a batch, and how it ended. exit_code: None if it was killed or never ran."""
 
     state: str
     exit_code: int | None
@@ -69,7 +69,9 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """The judged states: times t (T,) [s, of the truth], clearance said (T,) [mm], positions q (T, J), nearest."""
+    """The judged states: times t (T,) [s], the tool's clearance `said` (T,) [mm], positions q (T, J), nearest links
+    and splats.
+    """
 
     t: Floats
     said: Floats
@@ -80,7 +82,9 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """True clearance (T,) [mm] of the seen and of the collision surface, with the names of what is nearest."""
+    """True clearance (T,) [mm] of the visual and of the collision surface, with names of the nearest links and
+    objects.
+    """
 
     visual: Floats
     collision: Floats
@@ -89,7 +93,9 @@ class Truth:
 
 
 def read_recording(folder: Path, spheres_folder: Path) -> Recording:
-    """The recording in a folder, by its truth.json. Spheres that it does not name: ROBOT.yaml in their own folder."""
+    """The recording in a folder, by its truth.json. Spheres that truth.json does not name are ROBOT.yaml in
+    `spheres_folder`.
+    """
     document = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     log, urdf = folder / document["log"], folder / document["urdf"]
     spheres = folder / document.get("spheres", spheres_folder / f"{document['robot']}.yaml")
@@ -109,7 +115,7 @@ def read_recording(folder: Path, spheres_folder: Path) -> Recording:
 def judge_replay(
     recording: Recording, mode: str, nodes: Mapping[str, Node], batch: Path, clearances: Clearances
 ) -> Row:
-    """The row of a replay. nodes: by job; batch: the folder in which the batch has this recording's outputs."""
+    """The row of a replay. nodes: by job; batch: folder of the batch's outputs for this recording."""
     node = nodes[mode]
     answer = read_answer(node, batch / f"{mode}.json")
     if node.state == "skipped":
@@ -136,7 +142,7 @@ def judge_replay(
 
 
 def read_answer(node: Node, result: Path) -> Answer:
-    """The answer in a command's JSON: its verdict, its refusal, or a crash where it has neither."""
+    """The answer in a command's JSON: its verdict, its refusal, or else a crash."""
     if node.cause or node.exit_code is None:
         return Answer(outcome=CRASH, label="", reason=(node.cause or "did not run")[:NUM_CHARACTERS])
     try:
@@ -155,7 +161,7 @@ def read_answer(node: Node, result: Path) -> Answer:
 
 
 def read_motion(steps: Path, joints: tuple[str, ...]) -> Motion:
-    """The states in a replay's steps.csv; a clearance that is empty is NaN."""
+    """The states in a replay's steps.csv; an empty clearance is NaN."""
     with steps.open(encoding="utf-8", newline="") as stream:
         lines = [*csv.DictReader(stream)]
     return Motion(
@@ -168,7 +174,7 @@ def read_motion(steps: Path, joints: tuple[str, ...]) -> Motion:
 
 
 def read_truth(folder: Path, t: Floats | None) -> Truth:
-    """The truth of the logged motion at times t [s]; without them at its own."""
+    """The truth of the logged motion at times t [s]; None means the truth's own times."""
     with np.load(folder / "truth.npz") as known:
         times = known["t"] if t is None else t
         nearest = np.interp(times, known["t"], np.arange(len(known["t"]))).round().astype(np.int64)
@@ -181,7 +187,7 @@ def read_truth(folder: Path, t: Floats | None) -> Truth:
 
 
 def compare(row: Row, motion: Motion, truth: Truth) -> Row:
-    """A row with its figures: the tool's clearance of each state beside the true one."""
+    """A row with figures that compare the tool's clearance of each state with the true clearance."""
     row = replace(
         row,
         true_mm=float(truth.visual.min()),

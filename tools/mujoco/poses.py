@@ -19,7 +19,7 @@ def pose(place: Sequence[float] | Float64, turn: Float64 | None = None) -> Float
 
 
 def turn_rpy(rpy: Sequence[float] | Float64) -> Float64:
-    """The rotation matrix of roll, pitch and yaw [rad] about fixed axes, as URDF has it."""
+    """The rotation matrix of roll, pitch and yaw [rad] about fixed axes, as in URDF."""
     return np.asarray(Rotation.from_euler("xyz", rpy).as_matrix())
 
 
@@ -47,7 +47,7 @@ def moved(T: Float64, points: Float64) -> Float64:
 
 
 def look_at(eye: Sequence[float] | Float64, target: Sequence[float] | Float64) -> Float64:
-    """T_world_camera of an optical frame (z forward, y down) at eye (3,), that looks at target (3,), upright."""
+    """T_world_camera of an optical frame (z forward, y down) at eye (3,), upright, looking at target (3,)."""
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -56,11 +56,11 @@ def look_at(eye: Sequence[float] | Float64, target: Sequence[float] | Float64) -
 
 
 def quat_wxyz(T: Float64) -> Float64:
-    """The unit quaternion (4,) of a transform, scalar first, as MuJoCo has it."""
+    """The unit quaternion (4,) of a transform, scalar first, as in MuJoCo."""
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     return np.array([w, x, y, z])
 
 
 def quat_xyzw(T: Float64) -> Float64:
-    """The unit quaternion (4,) of a transform, scalar last, as ROS has it."""
+    """The unit quaternion (4,) of a transform, scalar last, as in ROS."""
     return np.asarray(Rotation.from_matrix(T[:3, :3]).as_quat())

@@ -1,4 +1,4 @@
-"""A recording from its seed and index: drawn, rendered, logged, and its truth written beside it."""
+"""A recording from its seed and index: drawn, rendered, logged, with a file of its truth."""
 
 import json
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class Plan:
 
 
 def draw(seed: int, index: int) -> Plan:
-    """The recording of a seed and an index; the same for the same two. Families and robots come by turns."""
+    """The plan of a recording, determined by its seed and index. Families and robots take turns."""
     family = ORDER[index % len(ORDER)]
     robot = load_robot(list(ROBOTS)[(index + index // len(ORDER)) % len(ROBOTS)])
     rng = np.random.default_rng([seed, index])
@@ -167,7 +167,7 @@ def _log_state(robot: Robot, log: Log, time: float, q: Float64, velocity: Float6
 
 
 def _static_transforms(plan: Plan) -> list[Transform]:
-    """The world at a site, the robot's root in the world, and every camera where the log says it is."""
+    """Transforms of the world at a site, of the robot's root, and of every camera at its logged pose."""
     out: list[Transform] = [] if plan.T_site_world is None else [("site", "world", plan.T_site_world)]
     if plan.stage.robot.root != "world":
         out.append(("world", plan.stage.robot.root, np.eye(4)))

@@ -79,7 +79,7 @@ def choose_worst(rows: Sequence[Row]) -> list[Row]:
 
 
 def write_worst(out: Path, rows: Sequence[Row], batch: Path) -> None:
-    """Write worst/worst.md, with the replays' pictures of the worst rows. batch: where their outputs are."""
+    """Write worst/worst.md, with the replays' pictures of the worst rows. batch: folder of their outputs."""
     folder = out / "worst"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -95,7 +95,7 @@ def write_worst(out: Path, rows: Sequence[Row], batch: Path) -> None:
 
 
 def _measure_red(row: Row) -> float:
-    """The least clearance by the tool below the truth at its state; 0 where another criterion is broken."""
+    """True clearance minus the tool's least clearance [mm], at the same state; 0 if another criterion failed."""
     gap = row.worst_true_mm - row.said_mm
     return 0.0 if isnan(gap) else gap
 
@@ -109,9 +109,9 @@ def _name_cause(row: Row) -> str:
 
 
 def _name_red(row: Row) -> str:
-    """The criterion; of clearance also what is nearest, and if a true surface is there.
+    """The criterion; for clearance, also the nearest splat, and if a true surface may be there.
 
-    A point nearer to the arm than every true surface is at least that much away from them.
+    A point nearer to the arm than every true surface is at least the difference away from them.
     """
     if row.criterion != "clearance":
         return row.criterion
@@ -120,7 +120,7 @@ def _name_red(row: Row) -> str:
 
 
 def _count_outcomes(title: str, rows: Sequence[Row], key: Callable[[Row], str]) -> Table:
-    """Rows by a key and the truth, and how many have which outcome."""
+    """Numbers of rows with each outcome, by a key and the truth."""
     counts = Counter((key(row), row.truth, row.outcome) for row in rows)
     counts += Counter(("all", row.truth, row.outcome) for row in rows)
     lines = list[tuple[str, ...]]()
@@ -133,7 +133,7 @@ def _count_outcomes(title: str, rows: Sequence[Row], key: Callable[[Row], str]) 
 
 
 def _count_errors(rows: Sequence[Row]) -> Table:
-    """Answers that the truth contradicts, each of the runs that could have it."""
+    """Numbers of answers that the truth contradicts, out of the runs that could give them."""
     touching = [row for row in rows if row.true_mm < 0]
     near = [row for row in rows if 0 <= row.true_mm < GREEN_MM]
     clear = [row for row in rows if row.true_mm > RED_MM]
@@ -160,7 +160,7 @@ def _count_errors(rows: Sequence[Row]) -> Table:
 
 
 def _measure_audits(rows: Sequence[Row]) -> Table:
-    """The errors of audits by depth: over recordings the median and largest of each; over-estimates by state."""
+    """The errors of audits by depth: each recording's median and largest error, and over-estimates by state."""
     audits = [row for row in rows if row.mode == AUDIT and not isnan(row.median_mm)]
     lines = list[tuple[str, ...]]()
     for depth in (*sorted({row.depth for row in audits}), "all") if audits else ():

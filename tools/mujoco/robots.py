@@ -1,4 +1,4 @@
-"""Robots as their vendors describe them: links, joints, meshes as cameras see them, collision meshes as shipped."""
+"""Robots as their vendors describe them: links, joints, visual meshes, collision meshes."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ GREY = (0.75, 0.75, 0.76)
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A robot of the distribution: its URDF, and between which postures [rad] a motion starts.
+    """A robot of the distribution: its URDF, and bounds [rad] of a motion's first posture.
 
-    tip: the last link; reach [m]: how far it extends along its axis `out`; grip [m]: where the fingers are held.
-    is_tight: its collision meshes are replaced by the visual ones.
+    tip: the last link; reach [m]: how far it extends along its axis `out`; grip [m]: position of the fingers.
+    is_tight: visual meshes replace its collision meshes.
     """
 
     urdf: str
@@ -119,7 +119,7 @@ class Robot:
 
     @property
     def fixed_links(self) -> frozenset[str]:
-        """The root, and what is joined to it without a joint that moves."""
+        """The root, and links joined to it only by fixed joints."""
         found = {self.root}
         for joint in self.joints:
             if joint.kind == "fixed" and joint.parent in found:
@@ -129,7 +129,7 @@ class Robot:
 
 @cache
 def robots_folder() -> Path:
-    """The folder of the distribution that holds the robots. Raises LookupError where it is not installed."""
+    """The distribution's folder of robots. Raises LookupError if it is not installed."""
     for file in files(DISTRIBUTION) or ():
         if file.name == "panda.urdf":
             return Path(str(file.locate())).resolve().parents[2]
@@ -159,7 +159,7 @@ def load_robot(name: str) -> Robot:
 
 
 def write_tight_urdf(robot: Robot, folder: Path) -> Path:
-    """Write the URDF of a robot whose collision meshes are its visual ones, with its meshes, into a folder."""
+    """Write a robot's URDF with its visual meshes as collision meshes, and the meshes, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = ET.parse(robot.urdf)
     for entry in tree.getroot().findall("link"):
@@ -251,7 +251,7 @@ def _meshes(shape: ET.Element) -> list[tuple[trimesh.Trimesh, tuple[float, float
 
 
 def _rgb(mesh: trimesh.Trimesh) -> tuple[float, float, float]:
-    """The diffuse colour of a mesh's material; grey where it has none."""
+    """The diffuse colour of a mesh's material; grey without a material."""
     material = getattr(mesh.visual, "material", None)
     if material is None:
         return GREY

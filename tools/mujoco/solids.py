@@ -14,7 +14,7 @@ AWAY = np.array([0.0, 0.0, -30.0])  # [m] where what is not there is kept
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """Poses (K, 4, 4) at times (K,) [s]; at rest before and after them, straight and even in between."""
+    """Poses (K, 4, 4) at times (K,) [s]; at rest before and after them, with constant velocity between them."""
 
     times: Float64
     poses: Float64
@@ -35,9 +35,9 @@ class Track:
 class Solid:
     """A solid: `box` (half sizes), `cylinder` or `capsule` (radius, half length along z), `ball` (radius) or `lathe`.
 
-    A lathe turns a `profile` (P, 2) of radii and rising heights [m], whose ends lie on the axis, about z.
-    link: the link that it is fixed to, with `track` in that link's frame; held: from, to [s] while it moves with the
-    robot although its track is of the world. lost: share of its pixels that return no depth.
+    A lathe turns a `profile` (P, 2) of radii and rising heights [m], whose ends lie on the axis, about z. link: the
+    link that it is fixed to, with `track` in that link's frame. held: from, to [s] while it moves with the robot
+    although its track is in the world. lost: share of the solid's pixels that return no depth.
     """
 
     name: str
@@ -70,7 +70,7 @@ def fixed(T_world_solid: Float64) -> Track:
 def signed_distance(solid: Solid, points: Float64) -> tuple[Float64, Float64]:
     """Signed distance (Q,) [m] of points (Q, 3) in the solid's own frame, negative inside, and its gradient (Q, 3).
 
-    Of convex kinds the distance is a convex function, and the gradient supports it.
+    For convex kinds, the distance is a convex function, and the gradient is a subgradient.
     """
     if solid.kind in ("lathe", "frustum"):
         return _of_profile(points, solid.profile)
@@ -99,7 +99,7 @@ def _of_box(points: Float64, half: Float64) -> tuple[Float64, Float64]:
 
 
 def frusta(solid: Solid) -> tuple[Solid, ...]:
-    """The convex cone frusta that a lathe is stacked of; outside of it its distance is the least of theirs."""
+    """The convex frusta that compose a lathe; outside the lathe, its distance is the least of their distances."""
     return tuple(
         replace(solid, kind="frustum", profile=np.array([[0.0, a[1]], a, b, [0.0, b[1]]]))
         for a, b in pairwise(solid.profile)

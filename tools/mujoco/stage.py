@@ -1,4 +1,4 @@
-"""Draw a recording: a room with a table, a robot in motion, and things at a chosen clearance from it."""
+"""Draw a recording: a room with a table, a moving robot, and objects at a chosen clearance from it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -72,7 +72,7 @@ class Stage:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, robot: Robot, *, is_at_rest: bool = False) -> "Stage":
-        """A room, a motion that keeps off the table and itself, and three cameras."""
+        """A room, a motion without contact with the table or the robot itself, and three cameras."""
         stage = cls(rng=rng, robot=robot, motion=_drawn_motion(rng, robot, is_at_rest=is_at_rest))
         stage.solids += room()
         stage.use_cameras(("camera_left", "camera_right", "camera_back"))
@@ -94,7 +94,7 @@ class Stage:
         )
 
     def least(self, solids: Sequence[Solid], times: Float64 = SAMPLES) -> float:
-        """The least clearance [m] of the seen robot and what is fixed to it from solids."""
+        """The least clearance [m] from solids of the visible robot and the solids fixed to it."""
         seen, poses = self._surfaces(times)
         return float(clearance_of(seen, poses, solids, times).least.min())
 
@@ -120,8 +120,8 @@ class Stage:
     ) -> None:
         """Add solids where the recorded motion's least clearance from them is `clearance` [m], by bisection.
 
-        They are drawn towards a point of the robot at a time [s] from a direction `aside` (3,), else any horizontal
-        one; at_start [m]: their least clearance at the first moment. Raises NoPlaceError where none was found.
+        The solids move towards a point of the robot at time `second` [s], from the direction `aside` (3,) or a random
+        horizontal one. at_start [m]: their least clearance at the start. Raises NoPlaceError if no place was found.
         """
         for _ in range(20):
             marks = self.marks(float(self.rng.uniform(0.3, 3.7)) if second is None else second)
@@ -199,7 +199,7 @@ def draw_lens(rng: np.random.Generator) -> Lens:
 
 
 def draw_thing(rng: np.random.Generator, name: str, height: float | None = None) -> Make:
-    """A thing that stands on the table below a place; `height`: how far [m] it rises above the place."""
+    """An object on the table below a place; `height` [m]: how far it rises above the place."""
     kind = ("box", "can", "bottle", "ball")[int(rng.integers(4 if height is None else 3))]
     rgb = tuple(float(v) for v in rng.uniform(0.25, 0.85, 3))
     wide, turn = float(rng.uniform(0.03, 0.05)), turn_rpy((0.0, 0.0, float(rng.uniform(0, np.pi))))
@@ -232,7 +232,7 @@ def bottle(radius: float, height: float) -> Float64:
 
 
 def travelling(solids: Sequence[Solid], times: Sequence[float], offsets: Float64) -> list[Solid]:
-    """Solids that go by offsets (K, 3) [m] from their places at times (K,) [s]."""
+    """Solids that move to offsets (K, 3) [m] from their places at times (K,) [s]."""
     out = []
     for solid in solids:
         poses = np.repeat(solid.track.poses[:1], len(times), axis=0)
@@ -242,7 +242,7 @@ def travelling(solids: Sequence[Solid], times: Sequence[float], offsets: Float64
 
 
 def gap(one: Solid, other: Solid) -> float:
-    """At most how far [m] two solids are apart at their first poses, by the balls that hold them in the plane."""
+    """Horizontal gap [m] between circles around two solids at their first poses."""
     a, b = one.track.poses[0][:3, 3], other.track.poses[0][:3, 3]
     return float(np.linalg.norm((a - b)[:2])) - _girth(one) - _girth(other)
 
@@ -290,7 +290,7 @@ def _near_base(robot: Robot) -> set[str]:
 
 
 def _self_clearance(cell: Cell, q: Float64) -> float:
-    """The least distance [m] of two links with at least two others between them, by their collision hulls."""
+    """The least distance [m] between collision hulls of links with at least two links between them."""
     cell.place(q, 0.0)
     depth = {cell.robot.root: 0}
     for joint in cell.robot.joints:

@@ -18,7 +18,7 @@ TRUTHS = (CONTACT, "margin", CLEAR, UNKNOWN)
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One replay of one recording beside its truth; a figure that there is none of is NaN. Lengths in mm."""
+    """One replay of one recording, with its truth. Missing figures are NaN; lengths are in mm."""
 
     seed: int
     index: int
@@ -78,12 +78,12 @@ class Row:
 
     @property
     def is_useless_caution(self) -> bool:
-        """No answer, though truly clear and seen by three cameras or more."""
+        """True if there is no answer, though the motion is clear and at least three cameras see it."""
         return self.outcome in {NOT_EVALUABLE, REFUSED} and self.true_mm >= CAUTION_MM and self.num_cams >= 3
 
     @property
     def criterion(self) -> str:
-        """The broken one of a verdict; what stands first in the message of a refusal."""
+        """A verdict's failed criterion; or the first words of a refusal's message."""
         return (self.reason.partition(":")[0] if self.label else self.reason.partition(",")[0]) or "none"
 
 
@@ -100,7 +100,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def merge_rows(before: Iterable[Row], rows: Iterable[Row]) -> list[Row]:
-    """All rows by seed, index and mode; new rows replace every earlier one of their recording."""
+    """All rows by seed, index and mode; new rows replace all earlier rows of their recordings."""
     new = [*rows]
     recordings = {row.name for row in new}
     kept = [row for row in before if row.name not in recordings]
@@ -108,7 +108,7 @@ def merge_rows(before: Iterable[Row], rows: Iterable[Row]) -> list[Row]:
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Write a table; an earlier file stays whole until the new one is."""
+    """Write a table; an earlier file stays until the new file is complete."""
     part = path.with_name(f"{path.name}.part")
     with part.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")

@@ -67,7 +67,7 @@ class Log:
         self._write("/tf_static" if is_static else "/tf", message, time)
 
     def add_image(self, time: float, camera: Camera, color: NDArray[np.uint8], depth: NDArray[np.uint16]) -> None:
-        """Colour as JPEG, depth aligned to it in millimetres, and a camera_info beside each."""
+        """Colour as JPEG, depth aligned to it in millimetres, each with a camera_info."""
         header = self._header(time, f"{camera.name}_color_optical_frame")
         root = f"/camera/{camera.name}"
         good, jpeg = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])

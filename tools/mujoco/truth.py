@@ -1,8 +1,8 @@
-"""The exact clearance of a robot's surfaces from what stands there, at any state of a recording.
+"""The exact clearance of a robot's surfaces from all solids, at any state of a recording.
 
-A surface is triangles by link, met in patches. The least distance of a solid over a triangle is found by halving the
-triangle. A convex solid's distance is a convex function: its tangent at the middle bounds it from below. A lathe is a
-stack of convex frusta; within it the triangle's own radius bounds.
+A surface is triangles by link, grouped in patches. Halving a triangle finds the least distance of a solid over it. A
+convex solid's distance is a convex function, which its tangent at the triangle's middle bounds from below. A lathe is
+a stack of convex frusta; inside it, the triangle's radius gives the bound.
 """
 
 import json
@@ -29,7 +29,7 @@ MANY = 4_000_000  # cells of a lathe's search, beyond which it is not refined
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Triangles (F, 3, 3) [m] in one frame, sorted by patch; of each patch first triangle, middle and radius."""
+    """Triangles (F, 3, 3) [m] in one frame, sorted by patch, with each patch's first triangle, middle and radius."""
 
     triangles: Float64
     first: NDArray[np.int64]
@@ -104,7 +104,7 @@ def clearance_of(
 
 
 def _lower(body: Body, T: Float64, solid: Solid, best: Float64) -> None:
-    """Lower `best` (T,) to a body's distance where that is less; T (T, 4, 4) is of the body in the solid's frame."""
+    """Lower `best` (T,) to a body's distance, if less; T (T, 4, 4) maps the body's frame to the solid's."""
     middles = np.einsum("tij,pj->tpi", T[:, :3, :3], body.middles) + T[:, None, :3, 3]
     away = _distances(solid, middles)
     np.minimum(best, (away + body.radii).min(axis=1), out=best)
@@ -141,7 +141,7 @@ def _distances(solid: Solid, points: Float64) -> Float64:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """A robot and what stands about it over time: all that the truth needs."""
+    """A robot and the solids about it over time."""
 
     robot: Robot
     solids: tuple[Solid, ...]
@@ -152,7 +152,7 @@ class World:
         return tuple(solid for solid in self.solids if solid.link is None and solid.held is None)
 
     def seen(self) -> dict[str, Body]:
-        """The surface that cameras see of each moving link, with what is fixed to it."""
+        """The visual surface of each moving link, with the solids fixed to it."""
         pieces = {link: list(found) for link, found in self.robot.visual.items()}
         for solid in self.solids:
             if solid.link is not None:
@@ -198,9 +198,9 @@ def _joined(seen: Clearance, held: Clearance, rows: NDArray[np.int64]) -> Cleara
 
 
 def mujoco_difference(world: World, time: float, q: Float64) -> float:
-    """The greatest |difference| [m] of MuJoCo's own distances to these, over convex solids that nothing touches.
+    """The greatest |difference| [m] between MuJoCo's distances and these, over untouched convex solids.
 
-    Both are of the convex hulls of collision meshes, which is what MuJoCo measures.
+    Both use convex hulls of collision meshes, because MuJoCo does.
     """
     cell = Cell(world.robot, world.obstacles, ())
     cell.place(q, time)
@@ -228,7 +228,7 @@ def _hull(piece: Piece) -> Piece:
 
 
 def clearances(folder: Path, t: Float64, q: Float64) -> tuple[Float64, Float64]:
-    """Clearance (T,) [m] of what is seen and of the collision geometry, of a motion driven in a recording's world."""
+    """Clearance (T,) [m] of the visual and of the collision geometry, for a motion driven in a recording's world."""
     seen, colliding = load_world(folder).clearances(np.asarray(t, np.float64), np.asarray(q, np.float64))
     return seen.least, colliding.least
 

@@ -275,7 +275,6 @@ def _merge(options: Table, chosen: Variant) -> dict[str, Any]:
 
 
 def _fill_places(value: Any, filled: Callable[[str], Any]) -> Any:
-    """Fill each {place}; a text of only one place may become a list."""
     if isinstance(value, str):
         if alone := _PLACE.fullmatch(value):
             return filled(alone[1])

@@ -148,7 +148,6 @@ def known_space(judged: Judged) -> Iterator[Reason]:
 
 
 def _unknown_share(judged: Judged) -> Reason:
-    """The mean share, at the first state above the allowed one."""
     trace, share = judged.replay.trace, judged.metrics["unknown_share"]
     first_s = trace.seconds(int(np.argmax(trace["unknown_share"] > judged.request.max_unknown)))
     return not_evaluable(sentence="", value=share, time_s=first_s, count=judged.replay.num_states)
