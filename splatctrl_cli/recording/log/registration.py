@@ -32,6 +32,7 @@ from splatctrl_cli.geometry import (
 from splatctrl_cli.recording.source_options import NUM_COEFFICIENTS
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
 
+STILL_SAMPLES = 1000  # of a transform, by which it counts as still
 _Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 
@@ -78,7 +79,8 @@ class _Edge:
 
     def still(self) -> Float64 | None:
         """T_parent_child (4, 4) if it never changes, else None."""
-        poses = iter(self.static.values()) if self.static else map(self._at, range(len(self.stamps)))
+        step = max(1, len(self.stamps) // STILL_SAMPLES)
+        poses = iter(self.static.values()) if self.static else map(self._at, range(0, len(self.stamps), step))
         first = next(poses)
         return first if all(_is_still(first, T) for T in poses) else None
 
