@@ -23,9 +23,9 @@ import numpy as np
 from benchmarks.measure import Options, Result
 from benchmarks.random_tabletop import random_things
 from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.config.fixed import FEWEST_STRETCHES
-from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
-from splatctrl_cli.jobs.replay.evidence import misses_of
+from splatctrl_cli.config.fixed import FEWEST_BLOCKS
+from splatctrl_cli.evaluate.conformal import autocorrelation_time, block_of_sets, block_scores, conformal_rank
+from splatctrl_cli.jobs.replay.evidence import residuals_of
 from splatctrl_cli.jobs.replay.inputs import open_log, read_states
 from splatctrl_cli.jobs.replay.lockstep import reconstruct_scene
 from splatctrl_cli.jobs.replay.request import ReplayInputs, ReplayRequest
@@ -50,12 +50,12 @@ SETTINGS = ("scene.max_splats=5000", "scene.first_iterations=20", "scene.iterati
 NUM_SCENES, QUICK = 200, 4
 CLEAR = 0.01  # [m] at least between the moving arm and a thing
 GUESTS = 10**6  # added to a seed for the thing that visits
-ASKED = 0.5  # confidence for a further stretch, beside as much as the stretches allow: a single one allows it
+ASKED = 0.5  # confidence for a further block, beside as much as the blocks allow: a single one allows it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One scene: `kind` still or visited; num_stretches blocks of `length` sets. `further` [m]: largest residual of
+    """One scene: `kind` still or visited; num_blocks blocks of `length` sets. `further` [m]: largest residual of
     the block left out. It should be within `bound` [m] with probability `promise`; with the highest probability that
     the blocks allow, within `highest` [m] with highest_promise. least_margin [m]: least true clearance minus (map's
     clearance minus `full`), inf if no state is near. `full`: bound of all blocks with full_promise.
@@ -64,7 +64,7 @@ class Trial:
     seed: int
     kind: str
     num_sets: int
-    num_stretches: int
+    num_blocks: int
     length: int
     bound: float
     promise: float
@@ -106,20 +106,20 @@ def run(options: Options) -> Result:
     """Measure coverage, its nominal value, and the width of the bound, by kind and overall."""
     num = QUICK if options.is_quick else NUM_SCENES
     trials = [found for found in map(trial_of, range(num)) if found is not None]
-    median = np.median([(trial.num_stretches, trial.length, trial.seconds) for trial in trials], axis=0)
+    median = np.median([(trial.num_blocks, trial.length, trial.seconds) for trial in trials], axis=0)
     return Result(
         title=f"conformal: {num} random tables",
         columns=("scenes", "of", "number", "promised %", "covered %", "median mm", "90 % mm"),
         rows=rows_of(trials),
         notes=[
-            "{:g} stretches in the median, of {:g} sets; {:.1f} s of one core a scene".format(*median),
-            f"{num - len(trials)} scenes make fewer than {FEWEST_STRETCHES} stretches: not evaluable",
+            "{:g} blocks in the median, of {:g} sets; {:.1f} s of one core a scene".format(*median),
+            f"{num - len(trials)} scenes make fewer than {FEWEST_BLOCKS} blocks: not evaluable",
         ],
     )
 
 
 def trial_of(seed: int) -> Trial | None:
-    """One scene, None if its held-out sets form fewer than FEWEST_STRETCHES blocks."""
+    """One scene, None if its held-out sets form fewer than FEWEST_BLOCKS blocks."""
     start = time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -137,7 +137,9 @@ def trial_of(seed: int) -> Trial | None:
         )
         record, over = audited(inputs, recording, config)
         reach = config.verdict.evidence_reach
-        measured, exact = (misses_of(sets, inputs, record.trace, reach)[1][:, 0] for sets in evidence_of(recording))
+        measured, exact = (
+            residuals_of(sets, inputs, record.trace, reach)[1][:, 0] for sets in evidence_of(recording)
+        )
     return judged(seed, measured, exact, over, config.verdict.confidence, time.process_time() - start)
 
 
@@ -210,18 +212,18 @@ def judged(
 ) -> Trial | None:
     """Both tests, for a scene's residuals with and without noise."""
     length = autocorrelation_time(measured)
-    stretch = stretches(len(measured), length)
-    scores, deciding = stretch_scores(measured, stretch)
-    if len(scores) < FEWEST_STRETCHES:
+    block = block_of_sets(len(measured), length)
+    scores, deciding = block_scores(measured, block)
+    if len(scores) < FEWEST_BLOCKS:
         return None
     drawn = int(np.random.default_rng([seed, 8]).integers(len(scores)))
-    core = np.flatnonzero(stretch == stretch[deciding[drawn]])[:length]
+    core = np.flatnonzero(block == block[deciding[drawn]])[:length]
     others = np.delete(scores, drawn)
     return Trial(
         seed=seed,
         kind="visited" if seed % 2 else "still",
-        num_sets=len(stretch),
-        num_stretches=len(scores),
+        num_sets=len(block),
+        num_blocks=len(scores),
         length=length,
         bound=_bound(others, ASKED)[0],
         promise=_bound(others, ASKED)[1],
@@ -248,8 +250,8 @@ def rows_of(trials: Sequence[Trial]) -> list[list[str]]:
     groups = [(kind, list(group)) for kind, group in groupby(by_kind, key=lambda trial: trial.kind)]
     for kind, group in [*groups, ("all", list(trials))]:
         for what, promise, width, is_covered in (
-            ("a further stretch", "promise", "bound", lambda t: t.further <= t.bound),
-            ("a further stretch", "highest_promise", "highest", lambda t: t.further <= t.highest),
+            ("a further block", "promise", "bound", lambda t: t.further <= t.bound),
+            ("a further block", "highest_promise", "highest", lambda t: t.further <= t.highest),
             ("the arm", "full_promise", "full", lambda t: t.least_margin >= 0),
         ):
             promised = float(np.mean([getattr(trial, promise) for trial in group]))

@@ -14,10 +14,10 @@ from scipy import stats
 from splatctrl_cli.evaluate import metrics as module
 from splatctrl_cli.evaluate.conformal import (
     autocorrelation_time,
+    block_of_sets,
+    block_scores,
     conformal_bound,
     conformal_rank,
-    stretch_scores,
-    stretches,
 )
 from splatctrl_cli.evaluate.metrics import (
     FEWEST,
@@ -136,9 +136,9 @@ def test_the_autocorrelation_time_is_that_of_the_definition(values: list[int]) -
 
 @few(100)
 @given(num=st.integers(1, 60), length=st.integers(1, 12))
-def test_stretches_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
-    found = stretches(num, length)
-    expected = reference.stretches(num, length)
+def test_blocks_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
+    found = block_of_sets(num, length)
+    expected = reference.block_of_sets(num, length)
     assert found[-1] + 1 == max(len(expected), 1)
     for number, sets in enumerate(expected):
         assert (found[sets] == number).all()
@@ -147,7 +147,7 @@ def test_stretches_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
     assert (np.diff(found) >= 0).all() and (np.diff(found) <= 1).all()
 
 
-def test_a_miss_between_two_stretches_counts() -> None:
+def test_a_miss_between_two_blocks_counts() -> None:
     for at in range(40):
         series = 0.001 * (np.arange(40) % 2 == 0) + np.repeat(np.linspace(0.0, 0.004, 5), 8)
         series[at] = 0.5
@@ -180,7 +180,7 @@ def test_what_is_not_there_takes_no_part() -> None:
     assert abs(whole - part) <= 1
     bound = conformal_bound(with_holes[0], 0.9)
     assert bound is not None and np.isfinite(bound.bound) and with_holes[0][bound.at] == bound.bound
-    scores, deciding = stretch_scores(np.array([1.0, np.nan, 3.0, np.nan, np.nan, 2.0]), np.array([0, 0, 1, 2, 2, 3]))
+    scores, deciding = block_scores(np.array([1.0, np.nan, 3.0, np.nan, np.nan, 2.0]), np.array([0, 0, 1, 2, 2, 3]))
     assert (scores.tolist(), deciding.tolist()) == ([1.0, 3.0, 2.0], [0, 2, 5])
 
 
@@ -200,7 +200,7 @@ def test_a_further_exchangeable_score_is_covered_as_promised(kind: str, num: int
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6, 0.85])
-def test_a_further_stretch_of_a_slow_series_is_covered_as_promised(share: float) -> None:
+def test_a_further_block_of_a_slow_series_is_covered_as_promised(share: float) -> None:
     rng = np.random.default_rng(int(100 * share))
     num_sets, covered, promised = 150, [], []
     for row in correlated(rng, (600, 4 * num_sets), share):
@@ -211,8 +211,8 @@ def test_a_further_stretch_of_a_slow_series_is_covered_as_promised(share: float)
 
 
 @pytest.mark.parametrize("series", [[0.01], [np.nan] * 7, [], np.linspace(0.0, 1.0, 6)])
-def test_one_stretch_bounds_nothing(series: ArrayLike) -> None:
+def test_one_block_bounds_nothing(series: ArrayLike) -> None:
     """All of the last one is one drift."""
     assert conformal_bound(np.asarray(series, np.float64), 0.99) is None
     two = conformal_bound(np.array([0.01, 0.03]), 0.99)
-    assert (two.bound, two.num_stretches, two.confidence) == (0.03, 2, pytest.approx(2 / 3))
+    assert (two.bound, two.num_blocks, two.confidence) == (0.03, 2, pytest.approx(2 / 3))

@@ -1,4 +1,4 @@
-"""Split conformal prediction over stretches of time, each step as it is defined."""
+"""Split conformal prediction over blocks of time, each step as it is defined."""
 
 from fractions import Fraction
 
@@ -27,8 +27,8 @@ def autocorrelation_time(values: Float64) -> float:
     return total
 
 
-def stretches(num_sets: int, length: int) -> list[list[int]]:
-    """Whole stretches of `length` sets, of which each begins `length` sets after the last of the one before."""
+def block_of_sets(num_sets: int, length: int) -> list[list[int]]:
+    """Whole blocks of `length` sets, of which each begins `length` sets after the last of the one before."""
     found, first = [], 0
     while first + length <= num_sets:
         found.append(list(range(first, first + length)))

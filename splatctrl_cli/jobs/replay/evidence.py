@@ -1,9 +1,9 @@
 """References of a replay: held-out depth (``--evidence``), and the truth of a simulated log.
 
-The map's distance at a true surface point, where it should be 0, is called the miss. Let d be a sphere's true
-clearance, to surface point p. The exact distance is 1-Lipschitz: the map's clearance is at most d plus the miss at p.
-Let no miss within `verdict.evidence_reach` of the motion exceed b (`evaluate.conformal`). Then the true clearance is
-at least the map's clearance minus b, or exceeds that reach.
+The map's distance at a true surface point, where it should be 0, is called the residual. Let d be a sphere's true
+clearance, to surface point p. The exact distance is 1-Lipschitz: the map's clearance is at most d plus the residual
+at p. Let no residual within `verdict.evidence_reach` of the motion exceed b (`evaluate.conformal`). Then the true
+clearance is at least the map's clearance minus b, or exceeds that reach.
 """
 
 from collections.abc import Iterable, Iterator
@@ -157,18 +157,18 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
 
 
 def map_error(evidence: Evidence, inputs: ReplayInputs, trace: Trace, config: VerdictConfig) -> MapError:
-    stamps_ns, misses, num_points = misses_of(evidence.frame_sets(), inputs, trace, config.evidence_reach)
-    bound = conformal_bound(misses[:, 0], config.confidence)
+    stamps_ns, residuals, num_points = residuals_of(evidence.frame_sets(), inputs, trace, config.evidence_reach)
+    bound = conformal_bound(residuals[:, 0], config.confidence)
     error = MapError(
         source=evidence.name,
         num_sets=len(stamps_ns),
-        num_seen=int(np.isfinite(misses[:, 0]).sum()),
+        num_seen=int(np.isfinite(residuals[:, 0]).sum()),
         num_points=num_points,
         bound=None,
     )
     if bound is None:
         return error
-    x, y, z = (float(value) for value in misses[bound.at, 1:])
+    x, y, z = (float(value) for value in residuals[bound.at, 1:])
     return replace(
         error,
         bound=replace(bound, bound=max(bound.bound, 0.0)),
@@ -177,14 +177,14 @@ def map_error(evidence: Evidence, inputs: ReplayInputs, trace: Trace, config: Ve
     )
 
 
-def misses_of(
+def residuals_of(
     frame_sets: Iterable[TimeStep], inputs: ReplayInputs, trace: Trace, reach: float
 ) -> tuple[list[int], Float64, int]:
-    """Largest miss of each held-out frame set near the motion, without the robot.
+    """Largest residual of each held-out frame set near the motion, without the robot.
 
     Returns stamps [ns] of the T sets in the audited time, an array (T, 4) [m], and the number of points. Its columns
-    are the largest miss and the place, NaN without points. Near means within `reach` [m]. Each set is compared with
-    the map just before it: the next map contains other cameras of that moment, and misses less.
+    are the largest residual and the place, NaN without points. Near means within `reach` [m]. Each set is compared
+    with the map just before it: the next map contains other cameras of that moment, and its residuals are smaller.
     """
     swept, cameras = Swept.of(inputs.model, trace, reach), inputs.scene.figures().get("displaced_cameras") or {}
     motion, first_ns, last_ns = inputs.motion(), int(trace.stamp_ns[0]), int(trace.stamp_ns[-1])

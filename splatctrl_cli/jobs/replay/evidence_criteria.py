@@ -202,7 +202,7 @@ def map_error(judged: Judged) -> Iterator[Reason]:
 def bound_words(bound: ConformalBound) -> str:
     return (
         f"at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
-        f"{bound.num_stretches} blocks of held-out depth"
+        f"{bound.num_blocks} blocks of held-out depth"
     )
 
 

@@ -199,7 +199,7 @@ OF_STATES: Declared = (
     ),
     _of("map_age_s", "max_map_age_s", LARGEST, AGE, shown="map_age_s"),
     _map_error("map_error_bound", "bound", ERROR),
-    _map_error("map_error_blocks", "num_stretches", DESCRIBES),
+    _map_error("map_error_blocks", "num_blocks", DESCRIBES),
     _map_error("map_error_confidence", "confidence", GOOD_SHARE),
 )
 

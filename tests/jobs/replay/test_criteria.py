@@ -159,7 +159,7 @@ def displaced(sigma: float) -> Judged:
 
 def missing(error: float) -> Judged:
     """A run whose map misses surface by up to `error` [m], 10 cm from the arm."""
-    bound = ConformalBound(bound=error, confidence=0.9, num_stretches=9, length=1, at=0)
+    bound = ConformalBound(bound=error, confidence=0.9, num_blocks=9, length=1, at=0)
     return judged(map_error=MapError(source="cam3", num_sets=9, num_seen=9, num_points=5, bound=bound, time_s=0.1))
 
 

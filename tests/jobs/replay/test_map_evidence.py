@@ -103,8 +103,8 @@ def test_the_bound_is_that_of_what_the_map_misses(desk: Desk, scene: list[str]) 
     assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
     expected, metrics = conformal_bound(MISSES, 0.99), desk.metrics()
     assert metrics["map_error_bound"] == pytest.approx(MISSES.max(), abs=1e-4)
-    assert metrics["map_error_blocks"] == expected.num_stretches >= 4
-    assert metrics["map_error_confidence"] == pytest.approx(expected.num_stretches / (expected.num_stretches + 1))
+    assert metrics["map_error_blocks"] == expected.num_blocks >= 4
+    assert metrics["map_error_confidence"] == pytest.approx(expected.num_blocks / (expected.num_blocks + 1))
     assert reason(desk)["outcome"] == "passed" and reason(desk)["count"] == len(MISSES) * SIZE[0] * SIZE[1]
     assert f"map error at most {1e3 * metrics['map_error_bound']:.1f} mm with" in desk.verdict()["sentence"]
 
@@ -162,7 +162,7 @@ def test_a_request_can_ask_for_evidence(
     assert code == 0 or desk.verdict()["reasons"][0]["criterion"] == first
 
 
-def test_too_few_stretches_are_no_bound(desk: Desk, scene: list[str]) -> None:
+def test_too_few_blocks_are_no_bound(desk: Desk, scene: list[str]) -> None:
     assert judged(desk, scene, showing(MISSES)[:1], 5)["map_error_bound"] is None
     assert "1 of 1 held-out frame sets show surface" in reason(desk)["sentence"]
     assert "map error not measured" in desk.verdict()["notes"]
